@@ -16,6 +16,7 @@ from sceneslam.atlas.submaps.collector import Collector, Known
 from sceneslam.atlas.submaps.run_graph import RunGraph, SolvedRun
 from sceneslam.experiments.one_map.drive import RIG as SCANNING
 from sceneslam.graphs.edge import EdgeKind
+from sceneslam.types.covariance import unknown_motion
 from sceneslam.types.observation import Observation
 
 
@@ -131,6 +132,16 @@ def test_a_rewind_removes_submaps_and_what_was_measured_between_them_at_once():
         path.put(index * S, 4.5 + 0.25 * (index - 9))  # slower
     own.finish()
     assert [len(one.stamps_ns) for one in own.chain.submaps] == [6, 8, 11, 3]
+
+
+def test_a_piece_begins_with_each_later_session_also_with_one_that_comes_again():
+    """Bridged poses that replace all of a session's belong to the one before it again."""
+    own, begun = added(lambda stamp_ns: None), []
+    for second, session in enumerate((-1, 0, 1, 2, 1, 1, 2, 2, 0, 3)):
+        T, of_map = at(0.1 * second), unknown_motion(5.0)
+        known = Known(T_map_base=T, session=session, module="a", covariance=None, of_map=of_map)
+        begun.append(own.has_begun(known))
+    assert begun == [False, False, True, True, False, False, True, False, False, True]
 
 
 def test_a_rewind_to_before_the_run_leaves_nothing_until_poses_come():

@@ -80,9 +80,13 @@ class Collector:
         return self._level >= _LEVEL_RATIO * self._count
 
     def has_begun(self, known: Known) -> bool:
-        """Tell whether a piece of the run begins: nothing measured the motion to this pose."""
+        """Tell whether a piece of the run begins: nothing measured the motion to this pose.
+
+        None does where bridged poses replaced a session: they belong to the one before it, whose
+        piece goes on.
+        """
         before, self._session = self._session, known.session
-        if before in (-1, known.session):
+        if before == -1 or known.session <= before:
             return False
         first = self._known(known.begun_ns)
         return is_guessed((known if first is None else first).of_map)
