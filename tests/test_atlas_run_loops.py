@@ -11,6 +11,7 @@ from test_atlas_maps import WALL, map_of
 from test_atlas_submaps import S, at
 
 from sceneslam.atlas.lasting.saved_map import empty_map
+from sceneslam.atlas.submaps import graph as graph_of
 from sceneslam.atlas.submaps import run_graph
 from sceneslam.atlas.submaps.graph import Agreement, consistent, settle
 from sceneslam.atlas.submaps.path_drift import PathDrift
@@ -124,6 +125,22 @@ def test_after_a_loop_places_are_searched_around_where_motions_alone_lead(monkey
         query = searched.queries[second]
         np.testing.assert_array_equal(query.drift.sums, own.chain.drift[: len(query.drift.sums)])
     np.testing.assert_array_equal(query.plane[8], planar.from_transform(own.chain.T_run_node[8]))
+
+
+def test_loops_of_a_search_that_was_interrupted_are_found_again(monkeypatch):
+    Searched(monkeypatch, [off(0, 5), off(0, 6), off(1, 7)])
+    own, compare = finished(48), graph_of._agree
+    graph = RunGraph(empty_map(), lambda session: False)
+    graph.extend(grown(own, 7), is_level=True)
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(graph_of, "_agree", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        graph.extend(own.chain, is_level=True)
+    monkeypatch.setattr(graph_of, "_agree", compare)
+    assert len(graph.extend(own.chain, is_level=True).loops) == 3
 
 
 def test_forgotten_submaps_take_their_loops_with_them_and_are_searched_again(monkeypatch):

@@ -254,14 +254,13 @@ class Agreement:
 
     def add(self, loops: Sequence[Edge], T_map_node: NDArray[np.float64], drift: PathDrift) -> None:
         """Compare loops with all others; `T_map_node` (N, 4, 4) are the estimated nodes."""
-        count = len(self.loops)
-        self.loops = [*self.loops, *loops]
-        agree = np.zeros((len(self.loops), len(self.loops)), bool)
+        count, known = len(self.loops), [*self.loops, *loops]
+        agree = np.zeros((len(known), len(known)), bool)
         agree[:count, :count] = self._agree
-        for row in range(max(count, 1), len(self.loops)):
-            agree[row, :row] = _agree(self.loops[row], self.loops[:row], T_map_node, drift)
+        for row in range(max(count, 1), len(known)):
+            agree[row, :row] = _agree(known[row], known[:row], T_map_node, drift)
             agree[:row, row] = agree[row, :row]
-        self._agree = agree
+        self.loops, self._agree = known, agree  # last: Ctrl-C may interrupt the comparison
 
     def cut(self, count: int) -> None:
         """Leave the loops between the first `count` nodes."""

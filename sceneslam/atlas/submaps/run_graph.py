@@ -201,9 +201,9 @@ class RunGraph:
         for second in range(self._planned, len(chain) if is_level else 0):
             loops += self._plans.loops_to(query.to(second))
             loops += self._pieces.loops_to(query.to(second), self._T_map_node)
-        self._seen, self._planned = len(chain), len(chain) if is_level else self._planned
         if loops:
             self._found.add(loops, query.T_run_node, query.drift)
+        self._seen, self._planned = len(chain), len(chain) if is_level else self._planned
 
     def _may_close(self, first: int, second: int, submaps: Sequence[Submap]) -> bool:
         """Tell whether a loop may lead from a submap to a later one: not within closed sessions."""
