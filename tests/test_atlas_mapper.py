@@ -7,9 +7,12 @@ from functools import partial
 import numpy as np
 import pytest
 from test_atlas_maps import WALL, S, edge, map_of
+from test_view_merge import place, viewed
 
 from sceneslam.atlas import mapper as mapper_of
+from sceneslam.atlas.lasting.saved_map import empty_map
 from sceneslam.atlas.mapper import Mapper
+from sceneslam.atlas.places.floor_plan import join
 from sceneslam.atlas.places.localizer import Fix, LocalizationEvent
 from sceneslam.atlas.submaps.collector import Known
 from sceneslam.atlas.submaps.graph import LOADED
@@ -17,6 +20,7 @@ from sceneslam.experiments.one_map.drive import RIG
 from sceneslam.graphs.edge import EdgeKind
 from sceneslam.types import planar, se3
 from sceneslam.types.observation import LaserScan, Observation
+from sceneslam.types.rig import Camera, Rig, Sensor
 
 HERE = planar.to_transform(np.array([1.0, 2.0, 0.5]))
 ASIDE = planar.to_transform(np.array([1.0, 2.0, np.pi / 2]))
@@ -121,6 +125,40 @@ def test_a_run_tells_once_after_five_seconds_that_it_was_not_located(monkeypatch
     searched.answer, searched.T_map_run = LocalizationEvent.WITHDRAWN, None
     observe(8.0)
     assert events[1:] == [("relocalization_withdrawn", 8 * S, {"after_s": 7.0})]
+
+
+CAMERA = Camera(size_wh=(640, 480), fx=500.0, fy=500.0, cx=320.0, cy=240.0)
+SEEING = Rig(sensors=frozenset({Sensor.IMAGE}), camera=CAMERA)
+WALLS = map_of(WALL)
+VIEWS = viewed(map_of(join([])), [(se3.identity(), place(1))])
+
+
+@pytest.mark.parametrize(
+    ("rig", "loaded", "why"),
+    [
+        (RIG, VIEWS, "the robot has no sensor for the views in it"),
+        (SEEING, WALLS, "the robot has no sensor for the walls in it"),
+        (Rig(sensors=frozenset()), viewed(WALLS, [(se3.identity(), place(1))]), "walls and views"),
+        (RIG, map_of(join([])), "it shows neither walls nor views"),
+        (RIG, WALLS, None),
+        (SEEING, VIEWS, None),
+        (RIG, empty_map(), None),
+    ],
+)
+def test_a_map_that_no_sensor_can_recognize_is_told_at_the_start(rig, loaded, why):
+    events = []
+
+    def note(*event, **fields):
+        events.append((*event, fields))
+
+    Mapper(rig, known=lambda stamp_ns: None, note=note, loaded=loaded)
+    if why is None:
+        assert events == []
+    else:
+        ((kind, stamp_ns, fields),) = events
+        assert (kind, stamp_ns) == ("warning", 0)
+        assert "the run will not be found in the loaded map" in fields["what"]
+        assert why in fields["what"]
 
 
 class Busy(Executor):

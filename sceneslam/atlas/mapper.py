@@ -35,7 +35,7 @@ from sceneslam.types import se3
 from sceneslam.types.errors import InputError, text_of
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import Observation
-from sceneslam.types.rig import Rig
+from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.run import Note
 from sceneslam.types.se3 import Transform, Vector
 from sceneslam.views.view import Landmarks
@@ -354,11 +354,16 @@ class Mapper:
     def _made_localizer(
         self, rig: Rig, views: Sequence[tuple[Transform, Landmarks]]
     ) -> MapLocalizer | None:
-        """Return the localizer in the loaded map, None if it shows nothing."""
+        """Return the localizer in the loaded map, None if no sensor sees what it shows."""
         plan, finder = self._loaded.plan(), None
-        if views and rig.camera is not None and self._views.can_look:
+        if views and rig.camera is not None and Sensor.IMAGE in rig.sensors:
             finder = ViewFinder(rig.camera, views)
-        if not len(plan) and finder is None:
+        if finder is None and not (len(plan) and self._scanner.can_scan):
+            if self._loaded.submaps:
+                shown = " and ".join(["walls"] * bool(len(plan)) + ["views"] * bool(views))
+                why = f"the robot has no sensor for the {shown} in it"
+                why = why if shown else "it shows neither walls nor views"
+                self._warn(0, f"the run will not be found in the loaded map: {why}")
             return None
         return MapLocalizer(plan, finder, standing=self._loaded.standing)
 
@@ -368,11 +373,15 @@ class Mapper:
             return self._scanner.make(observation)
         except InputError as error:  # as of a depth image that has another size than before
             if not self._has_refused:
-                what = f"the submaps are without such a measurement: {error}"
-                _log.warning("%s", what)
-                self._note("warning", observation.stamp_ns, what=what)
+                self._warn(
+                    observation.stamp_ns, f"the submaps are without such a measurement: {error}"
+                )
             self._has_refused = True
             return None
+
+    def _warn(self, stamp_ns: int, what: str) -> None:
+        _log.warning("%s", what)
+        self._note("warning", stamp_ns, what=what)
 
     def _pose_at(self, stamp_ns: int) -> Transform | None:
         known = self._known(stamp_ns)

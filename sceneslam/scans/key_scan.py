@@ -12,7 +12,7 @@ from sceneslam.scans.lidar_scan import LidarScanner
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import LaserScan, Observation
-from sceneslam.types.rig import Rig
+from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.se3 import Transform
 
 _LEVEL_COS = np.cos(np.radians(5.0))  # lasers with more tilt measure floor and ceiling
@@ -37,7 +37,7 @@ class KeyScanner:
     """Makes scans of observations, by the rig's sensor with the widest field of view."""
 
     def __init__(self, rig: Rig) -> None:
-        self._laser = rig.laser
+        self._sensors, self._laser = rig.sensors, rig.laser
         if self._laser is not None and abs(self._laser.T_base_laser[2, 2]) < _LEVEL_COS:
             self._laser = None
         self._lidar: LidarScanner | None = None
@@ -49,6 +49,12 @@ class KeyScanner:
                 self._depth = DepthScanner(rig.camera, beams=_DEPTH_BEAMS, stride_px=_STRIDE_PX)
             except ConfigError:  # it sees only the floor or the ceiling
                 self._depth = None
+
+    @property
+    def can_scan(self) -> bool:
+        """Tell whether the rig has a sensor that sees walls."""
+        made = {Sensor.SCAN: self._laser, Sensor.POINTS: self._lidar, Sensor.DEPTH: self._depth}
+        return any(sensor in self._sensors for sensor, by in made.items() if by is not None)
 
     def make(self, observation: Observation) -> KeyScan | None:
         """Return the scan of an observation, None without a suitable sensor."""

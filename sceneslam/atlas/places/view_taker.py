@@ -31,11 +31,6 @@ class ViewTaker:
         self._shear_rad = 0.0
         self._measures_depth = Sensor.DEPTH in rig.sensors
 
-    @property
-    def can_look(self) -> bool:
-        """Tell whether there is a camera."""
-        return self._viewer is not None
-
     def move(self, stamp_ns: int, T_run_base: Transform) -> None:
         """Follow the pose (4, 4) of every observation."""
         if self._viewer is None:
