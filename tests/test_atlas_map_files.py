@@ -2,6 +2,7 @@
 
 import hashlib
 import io
+from concurrent.futures import Future
 from dataclasses import replace
 
 import numpy as np
@@ -355,6 +356,20 @@ def test_a_map_is_saved_at_intervals_and_at_the_end(tmp_path, monkeypatch):
     own.finish(Mapped(), 12 * S, lambda *event, **fields: events.append((event, fields)))
     assert events == [(("map_saved", 12 * S), {"submaps": 1, "loops": 1})] and len(written) == 4
     assert own.faults == []
+
+
+def test_a_map_is_saved_as_soon_as_there_is_one_and_the_last_is_written(tmp_path, monkeypatch):
+    own, written = lasting(tmp_path, monkeypatch, every_s=10.0)
+    run, writing = Mapped(), Future()
+    own._writing, run.has_submaps = writing, False
+    counts = []
+    for second in range(0, 26):
+        run.has_submaps |= second == 12
+        if second == 14:
+            writing.set_result(True)
+        own.keep(second * S, run)
+        counts.append(len(written))
+    assert counts == [0] * 14 + [1] * 10 + [2] * 2
 
 
 @pytest.mark.parametrize("failure", [OSError, MemoryError])

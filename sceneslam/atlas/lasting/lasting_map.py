@@ -74,14 +74,14 @@ class LastingMap:
         self._executor = executor("save", is_live=is_live)
 
     def keep(self, stamp_ns: int, mapper: Mapper) -> None:
-        """Save if `save_every_s` have passed since the last time."""
+        """Save if `save_every_s` have passed since the last time, once there is what to save."""
         if self._saved_ns is None:
             self._saved_ns = stamp_ns
         if self._save is None or stamp_ns - self._saved_ns < self._every_ns:
             return
-        self._saved_ns = stamp_ns
         is_writing = self._writing is not None and not self._writing.done()
-        if mapper.has_submaps and not is_writing:  # else there is nothing new
+        if mapper.has_submaps and not is_writing:
+            self._saved_ns = stamp_ns
             self._writing = self._executor.submit(self._write, mapper.saved(), mapper.is_found)
 
     def map_of(self, mapper: Mapper) -> SavedMap:
