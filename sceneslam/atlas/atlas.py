@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Collection, Sequence
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -139,7 +138,7 @@ class Atlas:
         """Solve the graph and save the map."""
         assert self._mapper is not None and self._note is not None
         revised = self._revise().T_map_base
-        at = partial(self._revised_at, revised)
+        at = dict(zip(self._path.stamps_ns, revised, strict=True)).get
         layers = [session.layers for session in self._sessions]
         self.end_with(self._mapper.finish(at, layers))
         self._lasting.faults += self._mapper.faults
@@ -356,10 +355,6 @@ class Atlas:
 
     def _closes_loops(self, session: int) -> bool:
         return session >= 0 and self._sessions[session].module in self._closing
-
-    def _revised_at(self, revised: NDArray[np.float64], stamp_ns: int) -> Transform | None:
-        row = self._path.row_at(stamp_ns)
-        return None if row is None else np.asarray(revised[row])
 
     def _corrected(self) -> Revised:
         """Return the poses that the correction applies to."""
