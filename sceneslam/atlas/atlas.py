@@ -56,7 +56,6 @@ class Atlas:
         self._is_over = False  # the correction is of the poses as revised, before: as told
         self._voxel_m = voxel_m
         self._sessions: list[OpenSession] = []
-        self._closing: frozenset[str] = frozenset()  # modules that close loops themselves
         self._online = PoseLog()  # as reported at the time
         self._path = PosePath()  # after corrections
         self._journal: TrajectoryLog | None = None
@@ -79,7 +78,7 @@ class Atlas:
         `closing` are the modules that close loops themselves. With `is_looking`, places are
         recognized by what a camera sees.
         """
-        self._closing = frozenset(closing)
+        closed = frozenset(closing)
         self._note = note
         loaded = self._lasting.loaded
         self._lasting.open(is_live=is_live)
@@ -89,7 +88,7 @@ class Atlas:
             rig,
             known=self._path.known_at,
             note=note,
-            is_closed=self._closes_loops,
+            is_closed=lambda session: session >= 0 and self._sessions[session].module in closed,
             loaded=loaded,
             moves_loaded=self._lasting.saves,
             keeps_views=is_looking or self._lasting.saves,
@@ -352,9 +351,6 @@ class Atlas:
             return None
         T_map_laser = T_map_local @ layers.scans.T_world_laser
         return self._correction.apply(layers.scans.stamps_ns, T_map_laser)
-
-    def _closes_loops(self, session: int) -> bool:
-        return session >= 0 and self._sessions[session].module in self._closing
 
     def _corrected(self) -> Revised:
         """Return the poses that the correction applies to."""
