@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sceneslam.types.covariance import covariance_of, updated
+from sceneslam.types.covariance import covariance_of, symmetric, triangle, updated
 
 
 def turned(variances, seed=0):
@@ -17,6 +17,16 @@ def test_the_covariance_of_an_information_is_its_inverse_and_open_where_it_is_no
     values = [1e8, 1e8, 1e8, 1e8, 0.0, -3e-6]
     found = np.linalg.eigvalsh(covariance_of(turned(values), unmeasured=1e-2))
     np.testing.assert_allclose(found, [1e-8] * 4 + [100.0] * 2, rtol=1e-4)
+
+
+def test_covariances_are_those_of_their_upper_triangles_row_by_row():
+    one = np.arange(21.0)
+    np.testing.assert_array_equal(symmetric(one)[:2, :3], [[0.0, 1.0, 2.0], [1.0, 6.0, 7.0]])
+    many = np.stack([one, -one])[None]
+    found = symmetric(many)
+    np.testing.assert_array_equal(found, found.swapaxes(-1, -2))
+    np.testing.assert_array_equal(triangle(found), many)
+    assert symmetric(np.zeros((0, 21))).shape == (0, 6, 6)
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -14,14 +14,13 @@ from sceneslam.atlas.rows import Rows
 from sceneslam.atlas.submaps.collector import Known
 from sceneslam.atlas.uncertainty import Covariance
 from sceneslam.types import se3
-from sceneslam.types.covariance import semidefinite
+from sceneslam.types.covariance import TRIANGLE, semidefinite, symmetric, triangle
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.run import BRIDGED, SessionStart
 from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import Trajectory
 
-_UPPER = np.triu_indices(6)
-_NONE = np.full(len(_UPPER[0]), np.nan)  # no covariance was reported
+_NONE = np.full(TRIANGLE, np.nan)  # no covariance was reported
 _UNKNOWN = 1e10  # m^2, rad^2, of a robot that may be anywhere; float64 adds 1e-6 to no more
 
 
@@ -89,11 +88,11 @@ class PosePath:
         if module == BRIDGED and (not self.sessions or session != self.sessions[-1]):
             session = self.sessions[-1] if self.sessions else -1  # it begins with its first answer
         if map_covariance is None and len(self.poses) and session == self.sessions[-1]:
-            before = _square(self._maps[-1])
+            before = symmetric(self._maps[-1])
             if not np.isnan(before[0, 0]):
                 map_covariance = se3.carried(before, se3.inverse(T_map_base) @ self.poses[-1])
         for rows, given in ((self._covariances, covariance), (self._maps, map_covariance)):
-            reported = _NONE if given is None else given[_UPPER]
+            reported = _NONE if given is None else triangle(given)
             rows.append(np.clip(reported, -_UNKNOWN, _UNKNOWN))
         self.stamps_ns.append(stamp_ns)
         self.poses.append(T_map_base)
@@ -110,7 +109,7 @@ class PosePath:
 
     def covariance_at(self, row: int) -> Covariance | None:
         """Return the covariance (6, 6) that was reported with a pose, None without one."""
-        covariance = _square(self._covariances[row])
+        covariance = symmetric(self._covariances[row])
         return None if np.isnan(covariance[0, 0]) else covariance
 
     def row_at(self, stamp_ns: int) -> int | None:
@@ -128,7 +127,7 @@ class PosePath:
             session=self.sessions[row],
             module=self.modules[row],
             covariance=self.covariance_at(row),
-            of_map=np.nan_to_num(_square(self._maps[row])),
+            of_map=np.nan_to_num(symmetric(self._maps[row])),
             begun_ns=self.stamps_ns[bisect_left(self.sessions, self.sessions[row])],
         )
 
@@ -154,17 +153,10 @@ class PosePath:
 
 def _semidefinite(rows: Rows) -> NDArray[np.float64]:
     """Return reported covariances (N, 6, 6), positive semidefinite; NaN: not reported."""
-    covariances = _square(np.asarray(rows))
+    covariances = symmetric(np.asarray(rows))
     given = ~np.isnan(covariances[:, 0, 0])
     covariances[given] = semidefinite(covariances[given])
     return covariances
-
-
-def _square(triangles: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the symmetric matrices (..., 6, 6) of upper triangles (..., 21)."""
-    square = np.empty((*triangles.shape[:-1], 6, 6))
-    square[..., *_UPPER] = square[..., *_UPPER[::-1]] = triangles
-    return square
 
 
 def trajectory_of(stamps_ns: Sequence[int], poses: Rows) -> Trajectory:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.types import se3
+from sceneslam.types.covariance import triangle
 from sceneslam.types.files import replacing
 from sceneslam.types.maps import GridLayer, HybridMap, PoseGraphLayer
 from sceneslam.types.trajectory import Trajectory
@@ -66,7 +67,7 @@ def save_pose_graph(graph: PoseGraphLayer, path: Path) -> None:
     with replacing(path) as file:
         for row, numbers in enumerate(_quat_rows(graph.T_world_base)):
             file.write(f"VERTEX_SE3:QUAT {row} {numbers}\n")
-        upper = graph.information[:, *np.triu_indices(6)].tolist()
+        upper = triangle(graph.information).tolist()
         measured = zip(graph.edges.tolist(), _quat_rows(graph.T_from_to), upper, strict=True)
         for (start, end), numbers, weights in measured:
             words = " ".join(f"{weight:.9g}" for weight in weights)

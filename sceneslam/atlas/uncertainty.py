@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.types.covariance import TRIANGLE, symmetric, triangle
 from sceneslam.types.files import replacing
 from sceneslam.types.trajectory import parse_stamp_ns
 
@@ -58,7 +59,7 @@ def write_covariances(
 
     Of x y z [m] and the rotation vector [rad] in `base`: T_true = T_told exp(xi).
     """
-    rows = covariances[:, *np.triu_indices(6)].tolist()
+    rows = triangle(covariances).tolist()
     with replacing(path) as file:
         file.write("# stamp_s xx xy xz xr xp xw yy yz yr yp yw zz zr zp zw rr rp rw pp pw ww\n")
         for stamp_ns, row in zip(stamps_ns.tolist(), rows, strict=True):
@@ -73,8 +74,4 @@ def read_covariances(path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]
         stamp, *numbers = line.split()
         stamps_ns.append(parse_stamp_ns(stamp))
         rows.append([float(number) for number in numbers])
-    covariances = np.zeros((len(rows), 6, 6))
-    upper = np.triu_indices(6)
-    covariances[:, *upper] = np.array(rows).reshape(-1, 21)
-    covariances[:, *upper[::-1]] = covariances[:, *upper]
-    return np.array(stamps_ns, np.int64), covariances
+    return np.array(stamps_ns, np.int64), symmetric(np.array(rows).reshape(-1, TRIANGLE))

@@ -32,6 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.interfaces import TrajectoryLog
+from sceneslam.types.covariance import TRIANGLE, symmetric, triangle
 from sceneslam.types.errors import InputError
 from sceneslam.types.files import LogFile
 from sceneslam.types.se3 import Transform
@@ -41,7 +42,6 @@ JOURNAL = "journal.bin"
 MAGIC = b"SceneSLAM journal 3\n"
 _HEAD = struct.Struct("<cII")
 _STAMP = struct.Struct("<q")
-_UPPER = np.triu_indices(6)
 _POSE_BYTES = 12 * 8
 
 
@@ -97,7 +97,7 @@ class Journal:
         """Record a pose of the global trajectory, T_map_base (4, 4) [m]; covariances in base."""
         body = _STAMP.pack(stamp_ns) + _pose(T_map_base)
         for known in (covariance, map_covariance):
-            body += b"\0" if known is None else b"\1" + known[_UPPER].tobytes()
+            body += b"\0" if known is None else b"\1" + triangle(known).tobytes()
         self._add(b"P", body + module.encode())
 
     def add_rewind(self, stamp_ns: int) -> None:
@@ -204,11 +204,8 @@ def _covariance(body: bytes) -> tuple[NDArray[np.float64] | None, bytes]:
     """Return a covariance (6, 6) at the beginning, None without one, and what follows it."""
     if not body[0]:
         return None, body[1:]
-    end = 1 + 8 * len(_UPPER[0])
-    covariance = np.zeros((6, 6))
-    covariance[_UPPER] = np.frombuffer(body[1:end])
-    covariance.T[_UPPER] = covariance[_UPPER]
-    return covariance, body[end:]
+    end = 1 + 8 * TRIANGLE
+    return symmetric(np.frombuffer(body[1:end])), body[end:]
 
 
 def _tell_rewind(log: TrajectoryLog, body: bytes) -> None:

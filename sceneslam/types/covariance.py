@@ -11,6 +11,8 @@ from sceneslam.types.se3 import Transform
 Matrix = NDArray[np.float64]
 
 UNKNOWN_VELOCITY = np.array([1.0, 2.0])  # m/s, rad/s: standard deviations, of robots and by hand
+_UPPER = np.triu_indices(6)
+TRIANGLE = len(_UPPER[0])  # values in the upper triangle of a covariance (6, 6)
 _ANY_RAD = np.pi / np.sqrt(3.0)  # standard deviation of an angle that may be any
 
 
@@ -21,6 +23,18 @@ def covariance_of(information: Matrix, *, unmeasured: float) -> Matrix:
     """
     values, vectors = np.linalg.eigh(information)
     return np.asarray((vectors / np.maximum(values, unmeasured)) @ vectors.T)
+
+
+def triangle(matrices: Matrix) -> Matrix:
+    """Return the upper triangles (..., 21), row by row, of matrices (..., 6, 6)."""
+    return matrices[..., *_UPPER]
+
+
+def symmetric(triangles: Matrix) -> Matrix:
+    """Return the symmetric matrices (..., 6, 6) of upper triangles (..., 21)."""
+    matrices = np.empty((*triangles.shape[:-1], 6, 6))
+    matrices[..., *_UPPER] = matrices[..., *_UPPER[::-1]] = triangles
+    return matrices
 
 
 def semidefinite(matrices: Matrix) -> Matrix:
