@@ -33,7 +33,8 @@ class PlanField:
     def __init__(self, plan: FloorPlan) -> None:
         self.plan = plan
         self._free = np.pad(plan.free, _MARGIN)
-        self._origin = np.array(plan.origin_xy_m) - _MARGIN * CELL_M
+        # (2,), the outer corner of the likelihood's cell (0, 0)
+        self.origin_xy_m = np.array(plan.origin_xy_m) - _MARGIN * CELL_M
         image = np.ones(self._free.shape, np.uint8)
         cells = self._cells(plan.points)
         image[cells[:, 1], cells[:, 0]] = 0
@@ -74,10 +75,5 @@ class PlanField:
         clear = self._free & (self._far_m > _CLEAR_M)
         return np.where(clear, -1.0, near).astype(np.float32)
 
-    @property
-    def origin_xy_m(self) -> NDArray[np.float64]:
-        """Return the outer corner (2,) [m] of the likelihood's cell (0, 0)."""
-        return self._origin
-
     def _cells(self, points: NDArray[np.floating]) -> NDArray[np.int64]:
-        return np.asarray(np.floor((points - self._origin) / CELL_M).astype(np.int64))
+        return np.asarray(np.floor((points - self.origin_xy_m) / CELL_M).astype(np.int64))
