@@ -80,7 +80,7 @@ class Mapper:
         )  # None once it failed
         self._solving: tuple[Chain, Future[SolvedRun]] | None = None
         self._kept = 0  # submaps that are as they were given to the graph
-        self._solved = SolvedRun.nothing()
+        self._solved = SolvedRun(T_map_node=np.zeros((0, 4, 4)), loops=())
         self._is_news = False  # nodes were moved since the correction was taken
         self._is_over = False
         self._told: set[tuple[int, int, int]] = set()  # loops, by their run and stamps

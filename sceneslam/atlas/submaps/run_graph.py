@@ -45,11 +45,6 @@ class SolvedRun:
     own_loops: tuple[Edge, ...] = ()  # of modules, that were used too
     T_map_loaded: NDArray[np.float64] | None = None  # nodes (L, 4, 4) of the loaded map, if moved
 
-    @classmethod
-    def nothing(cls) -> SolvedRun:
-        """Return the solution without nodes."""
-        return cls(T_map_node=np.zeros((0, 4, 4)), loops=())
-
     def cut(self, count: int, loaded: int) -> SolvedRun:
         """Return the solution of the first `count` nodes, counted after those that were loaded."""
         return SolvedRun(
