@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sceneslam.atlas.places.floor_plan import FloorPlan, check_size, join
 from sceneslam.atlas.submaps.graph import connected, fits
-from sceneslam.atlas.submaps.submap import Submap
+from sceneslam.atlas.submaps.submap import Drawing, Submap
 from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.motion.tilt import upright
 from sceneslam.types import planar, se3
@@ -211,11 +211,12 @@ def forget_contradicted(saved: SavedMap, run: int) -> SavedMap:
     for index, submap in enumerate(saved.submaps):
         if submap.run == run or saved.pieces[index] != 0:
             continue
+        drawing = submap.drawing
         if len(submap.plan):
-            submap = submap.with_plan(_without(submap.plan, plane[index], today))
+            drawing = Drawing(_without(submap.plan, plane[index], today))
         is_old = are_covered(saved.views_of([index]), views_today)
         views = tuple(compress(submap.views, ~is_old))
-        submaps[index] = replace(submap, views=views)
+        submaps[index] = replace(submap, drawing=drawing, views=views)
     return replace(saved, submaps=tuple(submaps))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import pairwise
 from threading import Lock
 
@@ -78,10 +78,6 @@ class Submap:
     def plan(self) -> FloorPlan:
         """Return the floor plan, in the submap's frame."""
         return self.drawing.plan
-
-    def with_plan(self, plan: FloorPlan) -> Submap:
-        """Return the submap with another plan."""
-        return replace(self, drawing=Drawing(plan))
 
 
 def make_submap(poses: Sequence[KeyPose], run: int, T_base_cam: Transform) -> Submap:
