@@ -36,8 +36,7 @@ def save_map(hybrid: HybridMap, folder: Path) -> None:
         save_grid(hybrid.grid, folder / "grid.yaml")
     if hybrid.pose_graph is not None:
         save_pose_graph(hybrid.pose_graph, folder / "pose_graph.g2o")
-    if hybrid.landmarks is not None:
-        save_landmarks(hybrid, folder / "landmarks.ply")
+    save_landmarks(hybrid, folder / "landmarks.ply")
 
 
 def save_points(hybrid: HybridMap, path: Path) -> None:
@@ -51,7 +50,7 @@ def save_points(hybrid: HybridMap, path: Path) -> None:
 
 
 def save_landmarks(hybrid: HybridMap, path: Path) -> None:
-    """Write a binary PLY: x y z [m, map], stamp [s] of the first sighting, sightings, module."""
+    """Write landmarks, if any, as PLY: x y z [m, map], stamp [s] first seen, sightings, module."""
     layer, owners = hybrid.landmarks, hybrid.landmark_modules
     if layer is None or owners is None:
         return

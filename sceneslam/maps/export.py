@@ -11,7 +11,6 @@ from sceneslam.atlas.save import save_grid, save_pose_graph
 
 def export(saved: SavedMap, folder: Path) -> list[Path]:
     """Write `grid.pgm`, `grid.yaml`, `pose_graph.g2o` and `.tum` of the first piece."""
-    folder.mkdir(parents=True, exist_ok=True)
     main = saved.of(saved.nodes())
     grid, graph = folder / "grid.yaml", folder / "pose_graph.g2o"
     save_grid(grid_of(main.plan()), grid)

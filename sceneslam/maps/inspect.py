@@ -7,14 +7,13 @@ import numpy as np
 from sceneslam.atlas.lasting.saved_map import SavedMap
 from sceneslam.atlas.places.floor_plan import CELL_M
 from sceneslam.atlas.submaps.graph import connected, misfit, off_nodes
-from sceneslam.graphs.edge import EdgeKind
 
 _CHI2_6 = 22.46  # six degrees of freedom, p = 0.001
 
 
 def described(saved: SavedMap) -> list[str]:
     """Return the map's contents, a line per piece."""
-    loops = sum(edge.kind is EdgeKind.LOOP for edge in saved.edges)
+    loops = sum(edge.is_loop for edge in saved.edges)
     lines = [
         f"submaps: {len(saved.submaps)}, runs: {saved.run_count}, "
         f"edges: {len(saved.edges)}, of them loops: {loops}"
