@@ -9,7 +9,7 @@ import yaml
 from depth_views import CAMERA, CORRIDOR, RIG, ROOM, WALL, cave, depth_image, handheld, observe
 
 from sceneslam.evaluation.accuracy import absolute_errors
-from sceneslam.modules.slam.depth.certainty import DepthCertainty
+from sceneslam.modules.slam.camera_certainty import CameraCertainty
 from sceneslam.modules.slam.depth.keyframe_map import KeyframeMap
 from sceneslam.modules.slam.depth.localizer import DepthLocalizer
 from sceneslam.modules.slam.depth.module import DepthSlam
@@ -75,11 +75,18 @@ def test_points_that_err_together_count_as_few():
         found.append(register(samples, prior, [known], reader.grid, weak_ratio=0.005))
     assert found[0].common_ratio < 20.0
     assert found[1].common_ratio > 10.0 * found[0].common_ratio
-    certain, uncertain = DepthCertainty(T), DepthCertainty(T)
-    certain.follow(found[0], samples)
-    np.testing.assert_allclose(certain.covariance(np.eye(6)), np.eye(6))
-    uncertain.follow(found[1], samples)
-    assert uncertain.covariance(np.eye(6))[0, 0] > 1.5
+    kept = []
+    for one in found:
+        certainty = CameraCertainty(T)
+        certainty.follow(
+            common_ratio=one.common_ratio,
+            misfit=one.misfit,
+            T_keyframe_cam=one.T_keyframe_cam,
+            away2_m2=4.0,
+        )
+        kept.append(certainty.covariance(np.eye(6)))
+    np.testing.assert_allclose(kept[0], np.eye(6))
+    assert kept[1][0, 0] > 1.5
 
 
 def test_pulls_are_measured_where_rounding_leaves_an_information_below_zero():

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import yaml
 
+from sceneslam.modules.slam.camera_certainty import CORRELATION
 from sceneslam.modules.slam.direct.comparison import compare
 from sceneslam.modules.slam.direct.module import DirectSlam
 from sceneslam.modules.slam.direct.view import Tracker
@@ -105,6 +106,21 @@ def test_information_is_that_of_the_residuals():
     assert np.linalg.eigvalsh(found.information).min() > 0
     off = T_other_view @ se3.exp(np.array([0.3, 0.0, 0.0, 0.0, 0.0, 0.0]))
     assert compare(tracker, views[1], views[0], off).matched_ratio < found.matched_ratio
+
+
+def test_pixels_that_err_together_count_as_few():
+    """The right half is seen two pixels off, as by a wrong lens."""
+    tracker, seen = Tracker(CAMERA, 320, 0.3, 0.4), room_observation(0)
+    view, draw = tracker.view(seen.image_bgr, seen.depth_m), np.random.default_rng(0)
+    middle = CAMERA.size_wh[0] // 2
+    bent = seen.image_bgr.copy()
+    bent[:, middle:] = np.roll(bent[:, middle:], 2, axis=1)
+    found = []
+    for image_bgr in (seen.image_bgr, bent):
+        noisy = np.clip(image_bgr + 3.0 * draw.normal(size=bent.shape), 0, 255).astype(np.uint8)
+        found.append(compare(tracker, tracker.view(noisy, seen.depth_m), view, np.eye(4)))
+    independent, common = (one.common_ratio for one in found)
+    assert independent < 5.0 and common > CORRELATION
 
 
 def test_a_moment_without_depth_leaves_the_keyframe_as_it_is():

@@ -14,10 +14,10 @@ from sceneslam.types.observation import Observation, Tracking, TrackingStatus
 from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.trajectory import Trajectory
 
+from ..camera_certainty import CameraCertainty
 from ..local import LocalModule
 from ..surfaces.registration import CameraPrior, Samples, SurfaceRegistration, samples_of
 from ..surfaces.surface import DepthSurfaceReader, Doubles, Surface
-from .certainty import DepthCertainty
 from .history import PoseHistory
 from .keyframe_map import KeyframeMap
 from .localizer import DepthLocalizer
@@ -66,7 +66,7 @@ class DepthSlam(LocalModule):
         self._localizer = DepthLocalizer(
             self._map, matched_min_ratio=self.matched_min_ratio, weak_ratio=self.weak_ratio
         )
-        self._certainty = DepthCertainty(rig.camera.T_base_cam)
+        self._certainty = CameraCertainty(rig.camera.T_base_cam)
         self._history = PoseHistory(self._map)
         self._predictor = Predictor(rig)
         self._reference, self._revision = 0, 0
@@ -143,7 +143,12 @@ class DepthSlam(LocalModule):
     ) -> Tracking:
         T_base_cam = self._camera.T_base_cam
         back = se3.adjoint(se3.inverse(T_base_cam))
-        self._certainty.follow(found, samples)
+        self._certainty.follow(
+            common_ratio=found.common_ratio,
+            misfit=found.misfit,
+            T_keyframe_cam=found.T_keyframe_cam,
+            away2_m2=float(np.median((samples.points**2).sum(axis=1))),
+        )
         covariance = np.linalg.inv(found.information + self._prior(prediction).information)
         self._predictor.measure(
             observation,

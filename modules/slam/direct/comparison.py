@@ -11,6 +11,8 @@ from sceneslam.types import se3
 from sceneslam.types.covariance import semidefinite
 from sceneslam.types.spread import spread
 
+from ..camera_certainty import CORRELATION
+from ..model_error import squared, summed
 from .view import DirectView, Tracker
 
 Doubles = NDArray[np.float64]
@@ -19,7 +21,7 @@ _STEP_PX = 4  # distance between compared pixels
 _DEPTH_NOISE = (0.003, 0.0015)  # sigma = a + b z^2 [m], structured light
 _GATE_SIGMAS = 5.0  # larger differences of depth are other surfaces
 _GREY_SIGMA_MIN = 3.0  # grey values: smallest image noise
-_CORRELATION = 100.0  # correlated pixels with the information of one
+_CELLS = 8  # per image width, in which residuals are summed
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -28,6 +30,9 @@ class Comparison:
 
     information: Doubles  # (6, 6) of se3.log order, cam
     misfit: float  # negative logarithm of the likelihood, per pixel
+    common_ratio: float = 1.0  # by how much residuals pull more than independent ones
+    deeper_square: float = 0.0  # mean square of the differences of depth [sigma^2]
+    away2_m2: float = 0.0  # squared distance of what is seen, median
     compared: int  # pixels with depth in both views
     matched: int  # of these, on the same surface
 
@@ -84,11 +89,20 @@ def compare(
     # quarter of that of `brighter`: by it, darkness would say where it is.
     by_noise = 0.5 * noise / grey_sigma * jacobians[:, :2].reshape(-1, 6)
     seen = semidefinite(photometric.T @ photometric - by_noise.T @ by_noise)
+    pulls = (photometric * (brighter / grey_sigma)[:, None] + geometric * deeper[:, None]).T
+    side_px = -(-width // _CELLS)
+    together = squared(
+        summed(pulls, row // side_px * _CELLS + column // side_px),
+        photometric.T @ photometric + geometric.T @ geometric,
+    )
     return Comparison(
-        information=(seen + geometric.T @ geometric) / _CORRELATION,
+        information=(seen + geometric.T @ geometric) / CORRELATION,
         misfit=float(np.log(grey_sigma) + 0.5 * (_squared(brighter / grey_sigma) + apart)),
         compared=compared,
         matched=len(rows),
+        common_ratio=together / 6.0,
+        deeper_square=_squared(deeper),
+        away2_m2=float(np.median((points_view[rows] ** 2).sum(axis=1))),
     )
 
 

@@ -8,7 +8,7 @@ holds its result against the predicted pose, and adds checks and a covariance.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
 from sceneslam.types.rig import Rig, Sensor
 
+from ..camera_certainty import CameraCertainty
 from ..local import LocalModule
 from .comparison import Comparison, compare
 from .keyframes import DirectKeyframes
@@ -76,6 +77,7 @@ class DirectSlam(LocalModule):
         self._tracker = Tracker(rig.camera, self.width_px, self.step_max_m, self.turn_max_rad)
         self._predictor = Predictor(rig)
         self._keyframes = DirectKeyframes(self._tracker, self.cloud_voxel_m)
+        self._certainty = CameraCertainty(rig.camera.T_base_cam)
         self._new_ns = 0  # [ns] stamp at which the last image came first
         self._key: DirectView | None = None
         self._last: DirectView | None = None
@@ -83,6 +85,13 @@ class DirectSlam(LocalModule):
 
     def track(self, observation: Observation) -> Tracking:
         """Return T_local_base (4, 4) [m] at the observation."""
+        tracking = self._follow(observation)
+        if tracking.covariance is None:  # lost
+            return tracking
+        return replace(tracking, covariance=self._certainty.covariance(tracking.covariance))
+
+    def _follow(self, observation: Observation) -> Tracking:
+        """Return the answer by the noise of pixels alone."""
         prediction = self._predictor.predict(observation)
         image, depth_m = observation.image_bgr, observation.depth_m
         if image is None or depth_m is None:
@@ -174,6 +183,12 @@ class DirectSlam(LocalModule):
         self._predictor.measure(observation, T_local_base, covariance, information)
         T_local_cam = T_local_base @ T_base_cam
         T_key_cam = se3.inverse(self._T_local_key) @ T_local_cam
+        self._certainty.follow(
+            common_ratio=found.common_ratio,
+            misfit=found.deeper_square,
+            T_keyframe_cam=T_key_cam[None],
+            away2_m2=found.away2_m2,
+        )
         if not se3.is_within(T_key_cam, self.keyframe_step_m, self.keyframe_turn_rad):
             self._add_keyframe(observation, view, T_local_cam, found.information)
         self._last, self._T_local_last = view, T_local_cam

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from sceneslam.types import se3
 
+from ..camera_certainty import CORRELATION
 from ..degeneracy import Localizability, localizability
 from ..model_error import squared, summed
 from .keyframe import FACING_COS, SurfaceKeyframe
@@ -26,7 +27,6 @@ _GATE_SHRINK = 0.7
 _KERNEL_SIGMAS = 12.0  # threshold of the robust kernel
 _SURFACE_SIGMA_M = 0.001  # smallest standard deviation: roughness of surfaces
 _STEP_MIN = 1e-4  # m and rad: converged
-CORRELATION = 100.0  # correlated points with the information of one
 _POINTS_MIN = 100
 _BLOCKS = 4  # per image width, in which residuals are summed: fewer err together less
 
