@@ -73,6 +73,14 @@ def test_classes_are_found_by_patterns_of_their_labels(make, tmp_path, encoding)
     assert detector.get_scene(seen("Outdoor", 7)).scene == "Outside"
 
 
+def test_network_and_labels_in_the_home_folder_are_found(make, network, monkeypatch):
+    monkeypatch.setenv("HOME", str(network.parent))
+    (network.parent / "labels.txt").write_text("room\nmeadow\ncellar\n")
+    scenes = "+detector.scenes={Inside:[room,cellar],Outside:[meadow]}"
+    words = (f"detector.path='~/{network.name}'", "detector.labels='~/labels.txt'", scenes)
+    assert make("~detector.scenes", *words).scenes == ("Inside", "Outside")
+
+
 def test_image_that_fits_no_scene_well_enough_is_unsure(make):
     detector = make("detector.probability_min=1.0")
     assert detector.get_scene(seen("Indoor", 1)).scene == UNSURE

@@ -202,6 +202,11 @@ def test_a_feature_that_was_constant_in_training_decides_nothing():
     assert [model.scenes[place] for place in scores.argmax(axis=1)] == ["Bright", "Dark"] * 2
 
 
+def test_model_in_the_home_folder_is_found(model, monkeypatch):
+    monkeypatch.setenv("HOME", str(model.parent))
+    assert learned(Path("~") / model.name).scenes == learned(model).scenes
+
+
 @pytest.mark.parametrize("text", ["[]", "scenes: [A, B]", "a: [", "\x00"])
 def test_file_that_is_no_model_is_refused(tmp_path, text):
     (tmp_path / "model.yaml").write_text(text)

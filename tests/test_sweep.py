@@ -191,6 +191,13 @@ def test_maps_of_runs_that_are_composed_together_stay_apart(maps, is_allowed):
         check_maps_apart(runs)
 
 
+def test_maps_in_one_folder_are_found_under_each_of_its_names(monkeypatch, tmp_path):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    with pytest.raises(ConfigError, match=r"atlas\.save: got '~/map'"):
+        check_maps_apart([{"save": str(tmp_path / "map")}, {"save": "~/map"}])
+    check_maps_apart([{"save": str(tmp_path / "map"), "load": "~/map"}] * 2)
+
+
 @pytest.mark.parametrize("kind", ["run", "sweep"])
 def test_a_run_and_a_sweep_share_no_folder(folder, kind):
     RunFolder.claim(folder / "out", kind=kind).close()

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.types.errors import ConfigError, InputError
+from sceneslam.types.input_files import given_path
 from sceneslam.types.observation import UNSURE, Observation, SceneVote
 from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.scene_model import read_scene_model
@@ -27,7 +28,7 @@ class Learned:
     feature_settings = ("path",)
 
     def __init__(self, path: str | None) -> None:
-        file = _SHIPPED if path is None else Path(path)
+        file = _SHIPPED if path is None else given_path(path)
         model = read_scene_model(file)
         self.scenes = model.scenes
         try:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.types.errors import ConfigError, InputError
-from sceneslam.types.input_files import read_text
+from sceneslam.types.input_files import given_path, read_text
 from sceneslam.types.observation import UNSURE, Observation, SceneVote
 from sceneslam.types.rig import Rig, Sensor
 
@@ -68,7 +68,7 @@ class Onnx:
         self._output = output
         self._period_ns = 0 if rate_hz is None else round(1e9 / rate_hz)
         self._probability_min = probability_min
-        names = [] if labels is None else _read_labels(Path(labels))
+        names = [] if labels is None else _read_labels(given_path(labels))
         self._count = self._classify(np.zeros((8, 8, 3), np.uint8)).size
         if names and len(names) != self._count:
             raise ConfigError("labels", labels, f"a file of {self._count} lines, one per class")
@@ -134,10 +134,11 @@ class Onnx:
 
 def _read_network(path: str) -> cv2.dnn.Net:
     """Return the network; raises InputError if OpenCV cannot read it."""
-    if not Path(path).is_file():
+    file = given_path(path)
+    if not file.is_file():
         raise InputError(f"network not found, expected an ONNX file: {path}")
     try:
-        return cv2.dnn.readNetFromONNX(path)
+        return cv2.dnn.readNetFromONNX(str(file))
     except cv2.error as error:
         raise InputError(f"network: OpenCV cannot read it as ONNX: {path}") from error
 

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from sceneslam.types.errors import ConfigError
+from sceneslam.types.input_files import given_path
 from sceneslam.types.run import Command
 
 OWN_PREFIX = "sceneslam."
@@ -88,13 +89,19 @@ def check_maps_apart(runs: Iterable[Mapping[str, Any]]) -> None:
     """
     taken: set[Path] = set()
     for atlas in runs:
-        save, load = (Path(str(atlas.get(key))).resolve() for key in ("save", "load"))
-        if atlas.get("save") is None or save == load:
+        save = map_folder(atlas, "save")
+        if save is None or save == map_folder(atlas, "load"):
             continue
         if save in taken:
             allowed = "a folder of its own for every run, or the one in atlas.load"
             raise ConfigError("atlas.save", atlas["save"], allowed)
         taken.add(save)
+
+
+def map_folder(atlas: Mapping[str, Any], key: str) -> Path | None:
+    """Return the folder that `load` or `save` of a table `atlas` names; None: null."""
+    path = atlas.get(key)
+    return None if path is None else given_path(str(path)).resolve()
 
 
 def check_node(node: object, key: str, *, allow: Sequence[str], positional: int = 0) -> None:
