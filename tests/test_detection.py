@@ -116,6 +116,28 @@ def test_recording_is_read_once_for_all_settings(config, tmp_path, cache, monkey
         detect(config(*words, "run.max_observations=50"), tmp_path)  # other images
 
 
+def test_features_are_measured_again_after_an_edit(tmp_path, monkeypatch):
+    monkeypatch.setenv("SCENESLAM_CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.syspath_prepend(tmp_path)
+    code, exposures = tmp_path / "my_own_light.py", tmp_path / "exposures.txt"
+    source = {"_target_": "fakes.FakeSource", "steps": 20, "dark_from": 9}
+    target = "sceneslam.sources.changes.exposure_times.ExposureTimes"
+    effects = {"_target_": target, "path": str(exposures), "reference_s": None}
+    settings = faked(
+        source=source,
+        effects=effects,
+        run__mode="detect_only",
+        allow_targets=["fakes", "my_own_light"],
+    )
+    for text in ("0.0 0.01\n", "0.0 0.02\n"):
+        for version in ("1", "2"):
+            exposures.write_text(text)
+            code.write_text(f"version = {version}\n")
+            for _ in range(2):
+                detect(settings, tmp_path / "run")
+    assert len(list((tmp_path / "cache").glob("*.npz"))) == 4
+
+
 def test_events_that_a_full_disk_cuts_off_are_a_fault(config, tmp_path, monkeypatch):
     def fail(file, piece):
         raise OSError("no space left on device")

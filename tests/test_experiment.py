@@ -18,6 +18,7 @@ from fakes import LiveFeedSource
 from omegaconf import OmegaConf
 
 from sceneslam import cli
+from sceneslam.config.provenance import provenance
 from sceneslam.evaluation.verdict import verdict_lines, write_verdict
 from sceneslam.experiment import _prepare, _run_unless_finished, _Trials, _try_sources
 from sceneslam.experiments.openloris.dataset import Dataset
@@ -215,6 +216,44 @@ def test_a_trial_whose_metrics_could_not_be_saved_is_run_again(tmp_path, monkeyp
             _run_unless_finished(settings, tmp_path, "trial")
     _run_unless_finished(settings, tmp_path, "trial")
     assert (tmp_path / "metrics.json").is_file() and (tmp_path / "finished.json").is_file()
+
+
+def changed(name):
+    """Give a configuration that names a file, and the file with another content later."""
+    pen = Path("pen")  # relative, as a command line gives it
+    pen.mkdir()
+    file = pen / ("pens_own.py" if name == "allow_targets" else "file")
+    file.write_text("a = 1\n")
+    values = {
+        "allow_targets": {"allow_targets": ["fakes", "pens_own.detectors"]},
+        "effects": {"effects": {"_target_": "x", "path": "pen/file"}},
+        "detector": {"detector": {"_target_": "x", "path": "pen/file", "text": "a" * 5000}},
+        "labels": {"detector": {"_target_": "x", "labels": "pen/file"}},
+        "slam": {"slam": {"a": {"_target_": "x", "command": ["pen/file", "--fast"]}}},
+        "source": {"source": {"_target_": "x", "inner": {"path": "pen"}}},
+        "map": {"atlas": {"load": "pen", "save": "other"}},
+        "same_map": {"atlas": {"load": "pen", "save": "pen/../pen"}},
+        "record": {"effects": {"_target_": "x", "record": "pen/file"}},
+    }
+    return config(**values[name]), file
+
+
+@pytest.mark.parametrize(
+    ("name", "is_another"),
+    [
+        *((name, True) for name in ("allow_targets", "effects", "detector", "labels", "slam")),
+        *((name, True) for name in ("source", "map")),
+        *((name, False) for name in ("same_map", "record")),  # files that the run itself changes
+    ],
+)
+def test_an_edited_file_or_code_makes_another_trial(tmp_path, monkeypatch, name, is_another):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path / "pen")
+    settings, file = changed(name)
+    before = provenance(settings)
+    assert provenance(settings) == before
+    file.write_text("a = 2\n")
+    assert (provenance(settings) != before) is is_another
 
 
 def test_a_trial_whose_process_is_killed_is_one_sentence(tmp_path):

@@ -78,10 +78,9 @@ def _path(config: Mapping[str, Any], detector: FeatureDetector) -> Path:
         "effects": config.get("effects"),
         "detector": {name: node.get(name) for name in ("_target_", *detector.feature_settings)},
         "max_observations": config["run"].get("max_observations"),
-        "input": input_sha256(source),
-        "model": input_sha256(node),  # file of a trained detector, if any
         "code": code_sha256(),
     }
+    depends_on["input"] = input_sha256({**depends_on, "allow_targets": config.get("allow_targets")})
     text = json.dumps(depends_on, sort_keys=True, default=str)
     folder = source.get("cache_dir") or os.environ.get("SCENESLAM_CACHE_DIR") or _CACHE
     name = f"features_{hashlib.sha256(text.encode()).hexdigest()[:16]}.npz"
