@@ -7,7 +7,6 @@ import json
 import os
 import subprocess
 import sys
-from contextlib import nullcontext
 from pathlib import Path
 from time import process_time
 
@@ -22,7 +21,7 @@ from sceneslam.config.resolve import resolved
 from sceneslam.detection.features import RecordingFeatures
 from sceneslam.detection.grid import Axis, try_all
 from sceneslam.detection.run import detect
-from sceneslam.types.errors import ConfigError, InputError, ModuleError
+from sceneslam.types.errors import ConfigError, ModuleError
 from sceneslam.types.files import AppendedFile
 from sceneslam.types.truth import SceneChange
 
@@ -30,7 +29,6 @@ ROOT = Path(__file__).parents[1]
 TINY = ("story=flicker", "source.camera.size_wh=[80,60]", "source.camera.rate_hz=10")
 FULL = ("+scenario=single", "slam@slam.only=odometry", "detector=grey_mean", "run.report=false")
 FULL = (*FULL, "~sinks@sinks.rerun", "+scenes={Bright:[only],Dark:[only]}", "run.progress=false")
-BROKEN = pytest.raises(InputError, match="breaks off")
 
 
 @pytest.fixture(scope="module")
@@ -225,16 +223,13 @@ def test_a_detector_that_fails_is_one_sentence(config, tmp_path, monkeypatch, me
         detect(words, tmp_path)
 
 
-@pytest.mark.parametrize(("breaks_at", "outcome"), [(None, nullcontext()), (3, BROKEN)])
-def test_live_source_is_closed_at_the_end_of_a_run_without_slam(
-    cache, tmp_path, monkeypatch, breaks_at, outcome
-):
-    monkeypatch.setenv("SCENESLAM_CACHE_DIR", str(cache))
+def test_live_source_is_refused_by_a_run_without_slam_and_closed(tmp_path, monkeypatch):
+    monkeypatch.setenv("SCENESLAM_CACHE_DIR", str(tmp_path / "cache"))
     monkeypatch.setattr(LiveFeedSource, "is_open", True)
     source = {"_target_": "fakes.LiveFeedSource", "steps": 9, "dark_from": 5}
-    with outcome:
-        detect(faked(source=source | {"breaks_at": breaks_at}, run__mode="detect_only"), tmp_path)
-    assert not LiveFeedSource.is_open
+    with pytest.raises(ConfigError, match=r"run\.mode: got 'detect_only', allowed: live, since"):
+        detect(faked(source=source, run__mode="detect_only"), tmp_path / "run")
+    assert not LiveFeedSource.is_open and list(tmp_path.iterdir()) == []
 
 
 def test_detector_without_features_is_refused(config, tmp_path):

@@ -69,7 +69,7 @@ def build(config: Mapping[str, Any]) -> RunParts:
     source = make_source(config, builder)
     with ExitStack() as opened:  # closed again if it does not fit
         opened.callback(_release, source)
-        _check_mode(run, source)
+        check_mode(run, source)
         rig = source.rig
         check_detector(config, detector, rig)
         for key in modules:
@@ -117,6 +117,12 @@ def check_detector(config: Mapping[str, Any], detector: Detector, rig: Rig) -> N
     _check_sensors("detector", config["detector"], detector.requires, rig)
 
 
+def check_mode(run: RunSettings, source: Source) -> None:
+    """Raise ConfigError if a live source is run in another mode than `live`."""
+    if run.mode != LIVE and _feed(source) is not None:
+        raise ConfigError("run.mode", run.mode, f"{LIVE}, since this source measures now: run=live")
+
+
 def check_no_map(config: Mapping[str, Any]) -> None:
     """Raise ConfigError if a run without SLAM, which makes no map, is to load or save one."""
     atlas = _group(config, "atlas")
@@ -124,12 +130,6 @@ def check_no_map(config: Mapping[str, Any]) -> None:
         if atlas.get(name) is not None:
             allowed = f"null where run.mode is {DETECT_ONLY}: no map is loaded or saved"
             raise ConfigError(f"atlas.{name}", atlas[name], allowed)
-
-
-def _check_mode(run: RunSettings, source: Source) -> None:
-    """Raise ConfigError if a live source is run in another mode than `live`."""
-    if run.mode != LIVE and _feed(source) is not None:
-        raise ConfigError("run.mode", run.mode, f"{LIVE}, since this source measures now: run=live")
 
 
 def _feed(source: Source) -> LiveFeed | None:

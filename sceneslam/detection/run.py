@@ -11,7 +11,7 @@ from typing import Any
 from sceneslam.bus.policy import Policy
 from sceneslam.bus.scene.scene_filter import ConfirmedScene
 from sceneslam.bus.scene.watch import log_vote
-from sceneslam.config.build import check_detector, check_no_map, opened_source
+from sceneslam.config.build import check_detector, check_mode, check_no_map, opened_source
 from sceneslam.config.check import check_keys
 from sceneslam.config.component import ComponentBuilder
 from sceneslam.config.provenance import save_config
@@ -47,6 +47,7 @@ def watch(config: Mapping[str, Any]) -> Watched:
     run = builder.make("run", RunSettings)
     detector = builder.make("detector", FeatureDetector)
     with opened_source(config, builder) as source:
+        check_mode(run, source)
         rig = source.rig
         check_detector(config, detector, rig)
         features = recall(config, detector, source, run)
