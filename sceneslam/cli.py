@@ -218,6 +218,7 @@ def _run(config: DictConfig, folder: Path) -> Finished:
     choices = HydraConfig.get().runtime.choices
     title = str(choices.get("scenario") or choices.get("experiment") or "sceneslam")
     reference: Trajectory | None = None
+    partial: tuple[str, ...] = ()
     if config.get("reference"):
         finished = run(_reference(config), folder / "reference", title="reference")
         if finished.faults:
@@ -226,7 +227,9 @@ def _run(config: DictConfig, folder: Path) -> Finished:
         if finished.is_stop_requested:
             raise KeyboardInterrupt(f"{_UNBEGUN}; the reference is saved")
         reference = finished.trajectory
-    return run(resolved(config), folder, title=title, reference=reference, say=_say_before)
+        partial = tuple(f"reference: {one}" for one in finished.metrics["shortfalls"])
+    own = run(resolved(config), folder, title=title, reference=reference, say=_say_before)
+    return replace(own, faults=(*partial, *own.faults))
 
 
 def _reference(config: DictConfig) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from tqdm import tqdm
 
 from sceneslam.app import run
 from sceneslam.config.build import opened_source
-from sceneslam.config.check import check_given, check_maps_apart, first_line
+from sceneslam.config.check import check_given, check_maps_apart, check_no_reference, first_line
 from sceneslam.config.component import ComponentBuilder
 from sceneslam.config.overlay import command_of, comment_of
 from sceneslam.config.provenance import provenance, save_config
@@ -160,6 +160,7 @@ class _Trials:
             raise ConfigError(self._key, trial.name, f"values that fit ({reason})") from error
         check_trust(merged, self._overrides)
         plain = resolved(merged)
+        check_no_reference(plain, "in an experiment: it compares the runs of its own")
         return {
             name: value for name, value in plain.items() if name not in ("experiment", self._key)
         }

@@ -11,7 +11,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException, OverrideParseException
 
 from sceneslam import app
-from sceneslam.config.check import first_line
+from sceneslam.config.check import check_no_reference, first_line
 from sceneslam.config.resolve import resolved
 from sceneslam.config.words import check_trust, how_to_quote
 from sceneslam.storage.folder import RunFolder, give_back
@@ -27,7 +27,7 @@ def run(
 
     `overrides` are words of the command line: `"+scenario=bright_to_dark", "source.path=FOLDER"`.
     `folder` is the folder of the results (`outputs/DATE/TIME`), `config_dir` a folder of your own
-    configurations. Sweeps (`-m`) and experiments need the command line.
+    configurations. Sweeps (`-m`), experiments and `reference` need the command line.
 
     Raises ConfigError or InputError if nothing could be run. Later failures are in the result's
     `faults`.
@@ -35,6 +35,7 @@ def run(
     config = composed(overrides, config_dir)
     if config.get("experiment"):
         raise ConfigError("experiment", config["experiment"], "null: use python -m sceneslam")
+    check_no_reference(config, "in a script: use python -m sceneslam")
     is_stamped = folder is None
     path = Path(datetime.now().strftime(_STAMPED)) if folder is None else Path(folder)
     with closing(RunFolder.claim(path, is_stamped=is_stamped)) as claimed:

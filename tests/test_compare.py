@@ -24,6 +24,12 @@ def runs(tmp_path_factory, recording):
     ]
 
 
+def test_a_script_that_asks_for_a_reference_is_refused(tmp_path):
+    with pytest.raises(ConfigError, match=r"reference: got .*, allowed: null in a script"):
+        run(*WORDS, "source.path=x", "reference={seed:1}", folder=tmp_path / "run")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_script_gets_the_run_as_arrays(runs):
     whole = runs[0]
     assert whole.trajectory.T_world_base.shape == (30, 4, 4) and len(whole.modules) == 30

@@ -250,6 +250,11 @@ def test_map_is_refused_by_a_run_without_slam(config, tmp_path, key):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_reference_is_refused_by_a_run_without_slam(config, tmp_path):
+    with pytest.raises(ConfigError, match=r"reference: got .*, allowed: null where run\.mode is"):
+        detect(config(*TINY, "run=detect_only", "reference={seed:1}"), tmp_path / "alone")
+
+
 def swept(cache, folder, *words):
     command = [sys.executable, "-m", "sceneslam", "-m", *TINY, "run=detect_only", *words]
     done = subprocess.run(

@@ -326,6 +326,7 @@ def test_a_mistake_is_one_sentence(folder, overrides, sentence):
         ("table", ("+table.recordings.x=['source=tum_rgbd','source.path=no']",), "a folder: no"),
         ("table", ("table.modules=[depht]",), "Could not find 'slam/depht'"),
         ("matrix", ("matrix.seeds=[0]", "atlas.save=map"), "atlas.save: got 'map'"),
+        ("matrix", ("matrix.seeds=[0]", "reference={seed:1}"), "null in an experiment"),
         ("tune", ("tune.space.window.key=policy.windw_s",), "override 'policy.windw_s'"),
     ],
 )

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 from configured import config
 from fakes import FakeSource
+from omegaconf import OmegaConf
 from ros_recordings import make_source
 from test_preflight import CAMERA, write_folder
 
 from sceneslam.app import run
+from sceneslam.cli import carry_out
 from sceneslam.evaluation.report.summary import summary_lines
 from sceneslam.ros.writer import ObservationWriter
 from sceneslam.sources.bag.frames import FrameTree
@@ -20,6 +24,7 @@ from sceneslam.sources.bag.recording import ChunkedRecording
 from sceneslam.sources.contract.ordered import Ordered
 from sceneslam.sources.simulator.cache import Cache
 from sceneslam.sources.tum_rgbd import TumRgbd
+from sceneslam.storage.folder import RunFolder
 from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Camera, Rig, Sensor
@@ -49,6 +54,21 @@ def test_poses_that_are_missing_are_a_shortfall_with_its_reason(tmp_path):
     assert "evaluation.coverage_min_ratio 0.9" in sentence
     assert sentence.endswith("without: 92 while only was lost")
     assert shortfalls(tmp_path, **changes, evaluation__coverage_min_ratio=0.05) == []
+
+
+def test_poses_that_a_reference_lacks_are_told(tmp_path, monkeypatch):
+    hydra = SimpleNamespace(
+        runtime=SimpleNamespace(choices={}, output_dir=str(tmp_path)),
+        overrides=SimpleNamespace(task=["allow_targets=[fakes]"]),
+    )
+    monkeypatch.setattr("sceneslam.cli.HydraConfig.get", lambda: hydra)
+    lost = {"slam": {"only": {"lost": list(range(8, 100))}}}
+    changes = alone() | {"policy__lost_patience_s": 600.0}
+    with closing(RunFolder.claim(tmp_path)):  # as Hydra's callback does
+        ended = carry_out(OmegaConf.create(config(**changes) | {"reference": lost}))
+    assert ended.code == 1
+    (sentence,) = ended.errors
+    assert sentence.startswith("reference: only 8 % of the observations got a pose")
 
 
 @pytest.mark.parametrize("isolation", ["inline", "process"])

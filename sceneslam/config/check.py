@@ -98,6 +98,12 @@ def check_maps_apart(runs: Iterable[Mapping[str, Any]]) -> None:
         taken.add(save)
 
 
+def check_no_reference(config: Mapping[str, Any], where: str) -> None:
+    """Raise ConfigError if a configuration asks for a reference where none is compared."""
+    if config.get("reference"):
+        raise ConfigError("reference", config["reference"], f"null {where}")
+
+
 def map_folder(atlas: Mapping[str, Any], key: str) -> Path | None:
     """Return the folder that `load` or `save` of a table `atlas` names; None: null."""
     path = atlas.get(key)

@@ -12,10 +12,10 @@ from sceneslam.bus.policy import Policy
 from sceneslam.bus.scene.scene_filter import ConfirmedScene
 from sceneslam.bus.scene.watch import log_vote
 from sceneslam.config.build import check_detector, check_mode, check_no_map, opened_source
-from sceneslam.config.check import check_keys
+from sceneslam.config.check import check_keys, check_no_reference
 from sceneslam.config.component import ComponentBuilder
 from sceneslam.config.provenance import save_config
-from sceneslam.config.settings import RunSettings
+from sceneslam.config.settings import DETECT_ONLY, RunSettings
 from sceneslam.detection.decide import Filtered, filtered, vote
 from sceneslam.detection.features import RecordingFeatures
 from sceneslam.detection.recall import recall
@@ -43,6 +43,7 @@ def watch(config: Mapping[str, Any]) -> Watched:
     """Return the features for a configuration; raises ConfigError or InputError."""
     check_keys(config)
     check_no_map(config)
+    check_no_reference(config, f"where run.mode is {DETECT_ONLY}: it has no trajectory")
     builder = ComponentBuilder(config)
     run = builder.make("run", RunSettings)
     detector = builder.make("detector", FeatureDetector)
