@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from sceneslam.atlas.guarded import covariances_of, fused_map_of
 from sceneslam.atlas.save import save_map
 from sceneslam.bus.bus import Bus
 from sceneslam.config.build import RunParts
@@ -33,7 +34,6 @@ from sceneslam.sources.survey.survey import Surveyed
 from sceneslam.sources.survey.tally import Tally
 from sceneslam.storage.events import log_uncertainty
 from sceneslam.types.errors import InputError, text_of
-from sceneslam.types.maps import HybridMap, PointLayer
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Sensor
 from sceneslam.types.run import Event, RunResult, Timings
@@ -151,14 +151,11 @@ class RunLoop:
         return self._result
 
     def _add_covariances(self) -> None:
-        """Compute the trajectory's covariances; without them the run still has its results."""
-        atlas = self._parts.atlas
-        try:
-            self._covariances = atlas.covariances(Sensor.ODOMETRY in self._parts.rig.sensors)
+        """Compute the trajectory's covariances, and log those where sessions begin."""
+        atlas, has_odometry = self._parts.atlas, Sensor.ODOMETRY in self._parts.rig.sensors
+        self._covariances = covariances_of(atlas, self.faults.append, has_odometry=has_odometry)
+        if len(self._covariances):
             log_uncertainty(self._log, atlas.session_starts(), self._covariances)
-        except Exception as error:
-            _log.info("covariances", exc_info=error)
-            self.faults.append(f"the trajectory has no covariances: {text_of(error)}")
 
     def _gather(self) -> RunResult:
         atlas, bus = self._parts.atlas, self._bus
@@ -169,7 +166,7 @@ class RunLoop:
             covariances=self._covariances,
             modules=atlas.pose_modules,
             sessions=atlas.sessions,
-            map=self._fused(),
+            map=fused_map_of(atlas, self.faults.append),
             events=self._log.events,
             missing=self._tally.missing,
             dropped=self._live.dropped,
@@ -184,16 +181,6 @@ class RunLoop:
                 slowest=self._live.slowest.poses,
             ),
         )
-
-    def _fused(self) -> HybridMap:
-        """Return the fused map, empty if fusion fails: the trajectory is still saved."""
-        try:
-            return self._parts.atlas.fuse_maps()
-        except Exception as error:
-            _log.info("the maps could not be fused", exc_info=error)
-            self.faults.append(f"the maps could not be fused: {text_of(error)}")
-            nothing = PointLayer(points=np.zeros((0, 3), np.float32))
-            return HybridMap(points=nothing, point_modules=np.zeros(0, np.uint8), modules=())
 
     def _survey(self) -> None:
         """Print the survey of the recording, with warnings."""

@@ -107,6 +107,19 @@ def test_torn_ends_cost_what_is_torn_and_are_told(tmp_path, capsys, cut_bytes):
     assert all(json.loads(line)["event"] for line in lines)
 
 
+@pytest.mark.parametrize("what", ["covariances", "fuse_maps"])
+def test_a_part_that_fails_costs_no_pose(tmp_path, capsys, monkeypatch, what):
+    def fail(*_):
+        raise MemoryError("too large")
+
+    folder = killed(tmp_path, 20)
+    monkeypatch.setattr(f"sceneslam.atlas.atlas.Atlas.{what}", fail)
+    assert main([str(folder)]) == 1
+    assert "MemoryError: too large" in capsys.readouterr().err
+    assert len(Trajectory.read_tum(folder / "trajectory.tum")) == 21
+    assert (folder / "metrics.json").is_file() and (folder / "journal.bin").is_file()
+
+
 def test_a_recording_that_is_gone_costs_the_ground_truth_alone(tmp_path, capsys):
     folder = killed(tmp_path, 20)
     text = (folder / "config.yaml").read_text()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import chdir, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +16,7 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from sceneslam.atlas.atlas import Atlas
+from sceneslam.atlas.guarded import covariances_of, fused_map_of
 from sceneslam.atlas.submaps.correction import Correction
 from sceneslam.config.build import make_source
 from sceneslam.config.component import ComponentBuilder
@@ -75,7 +76,7 @@ def recover(folder: Path) -> Recovered:
         faults=[_sentence(atlas, kept), *(f"recovered without {what}" for what in missing)],
         source=source,
     )
-    result = _result(atlas, kept, events)
+    result = _result(atlas, kept, events, results.lose)
     results.save_trajectories(result)
     reference = folder / "reference" / "trajectory.tum"
     metrics = results.save_rest(
@@ -179,16 +180,18 @@ def _sentence(atlas: Atlas, kept: Kept) -> str:
     )
 
 
-def _result(atlas: Atlas, kept: Kept, events: list[Event]) -> RunResult:
+def _result(
+    atlas: Atlas, kept: Kept, events: list[Event], fault: Callable[[str], None]
+) -> RunResult:
     nothing: NDArray[np.float64] = np.zeros(0)
     return RunResult(
         observed_ns=kept.observed_ns,
         trajectory=atlas.trajectory,
         online=atlas.online,
-        covariances=atlas.covariances(kept.head.has_odometry),
+        covariances=covariances_of(atlas, fault, has_odometry=kept.head.has_odometry),
         modules=atlas.pose_modules,
         sessions=atlas.sessions,
-        map=atlas.fuse_maps(),
+        map=fused_map_of(atlas, fault),
         events=events,
         timings=Timings(detector_us=nothing, bus_us=nothing, module_ms={}, wall_s=0.0),
     )
