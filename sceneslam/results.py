@@ -45,7 +45,6 @@ class Results:
 
     def save_trajectories(self, result: RunResult) -> None:
         """Write the trajectories first, as they are the most important result."""
-        folder = self.folder
         with self._noting("the trajectory"):
             self._write_tum(result.trajectory, "trajectory.tum")
         with self._noting("the other trajectories"):
@@ -53,9 +52,12 @@ class Results:
             for session in result.sessions:
                 name = f"trajectory_{session.index}_{session.module}.tum"
                 self._write_tum(session.trajectory, name)
+        if len(result.covariances) < len(result.trajectory):
+            return  # they failed, as a fault says
+        with self._noting("the covariances"):
             stamps_ns = logged_ns(self.source, result.trajectory.stamps_ns)
             order = np.argsort(stamps_ns, kind="stable")
-            path = folder / "trajectory_covariance.txt"
+            path = self.folder / "trajectory_covariance.txt"
             write_covariances(path, stamps_ns[order], result.covariances[order])
 
     def save_rest(
@@ -69,27 +71,35 @@ class Results:
         """Write map, metrics and report; return the metrics."""
         compared = partial(
             evaluate,
-            result,
             settings=self.evaluation,
             peak_rss_mb=_peak_rss_mb() if has_costs else None,
         )
+        metrics: Metrics | None
         try:
-            metrics = compared(truth, reference=reference)
+            metrics = compared(result, truth, reference=reference)
         except Exception as error:  # such as NaN in the ground truth
             _log.info("no comparison", exc_info=error)
             self.faults.append(f"no comparison with the ground truth: {text_of(error)}")
             truth, reference = None, None
-            metrics = compared(truth, reference=reference)
+            metrics = None
         with self._noting("the metrics"):
+            metrics = metrics or compared(result, None)  # those of the run alone
+            write_metrics(self.folder / "metrics.json", metrics)
+        metrics = metrics or compared(_unevaluated(result), None)  # not written
+        with self._noting("the ground truth"):
             if truth is not None and len(truth.trajectory):
                 truth.trajectory.write_tum(self.folder / "groundtruth.tum")
-            write_metrics(self.folder / "metrics.json", metrics)
         with self._noting("the map"):
             save_map(result.map, self.folder / "map")
         if self.has_report:
             with self._noting("the report"):
                 self._write_report(result, truth, metrics, reference)
         return metrics
+
+    def lose(self, sentence: str) -> None:
+        """Record what could not be saved."""
+        self.unsaved.append(sentence)
+        self.faults.append(sentence)
 
     def _write_tum(self, trajectory: Trajectory, name: str) -> None:
         stamps_ns = logged_ns(self.source, trajectory.stamps_ns)
@@ -132,8 +142,22 @@ class Results:
             yield
         except Exception as error:
             _log.info("%s could not all be saved", what, exc_info=error)
-            self.unsaved.append(f"{what} could not all be saved: {text_of(error)}")
-            self.faults.append(self.unsaved[-1])
+            self.lose(f"{what} could not all be saved: {text_of(error)}")
+
+
+def _unevaluated(result: RunResult) -> RunResult:
+    """Return a run of which only the observations are known: its metrics can be had in any case."""
+    return RunResult(
+        observed_ns=result.observed_ns,
+        trajectory=Trajectory.empty(),
+        online=Trajectory.empty(),
+        covariances=result.covariances[:0],
+        modules=(),
+        sessions=(),
+        map=result.map,
+        events=(),
+        timings=result.timings,
+    )
 
 
 def _peak_rss_mb() -> float:

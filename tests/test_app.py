@@ -15,6 +15,7 @@ from fakes import LateStamps
 from sceneslam.app import run
 from sceneslam.atlas.atlas import Atlas
 from sceneslam.atlas.uncertainty import read_covariances
+from sceneslam.evaluation.metrics import evaluate
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.trajectory import Trajectory
 
@@ -225,6 +226,48 @@ def test_maps_that_cannot_be_fused_cost_the_map_alone(tmp_path, monkeypatch):
     finished = run(config(), tmp_path)
     assert finished.faults == ("the maps could not be fused: MemoryError: too large",)
     assert len(Trajectory.read_tum(tmp_path / "trajectory.tum")) == 100
+
+
+def test_covariances_that_fail_cost_their_file_alone(tmp_path, monkeypatch):
+    def fail(atlas, has_odometry):
+        raise MemoryError("too large")
+
+    monkeypatch.setattr("sceneslam.atlas.atlas.Atlas.covariances", fail)
+    finished = run(config(), tmp_path)
+    assert finished.faults == ("the trajectory has no covariances: MemoryError: too large",)
+    assert not (tmp_path / "trajectory_covariance.txt").exists()
+
+
+def test_metrics_that_fail_cost_neither_map_nor_report(tmp_path, monkeypatch):
+    def fail(*_):
+        raise MemoryError("too large")
+
+    real = evaluate
+
+    def breaks(result, *given, **more):
+        return fail() if len(result.trajectory) else real(result, *given, **more)
+
+    monkeypatch.setattr("sceneslam.results.evaluate", breaks)
+    finished = run(config(), tmp_path)
+    assert finished.faults[1] == "the metrics could not all be saved: MemoryError: too large"
+    assert finished.metrics["observations"] == 100 and not (tmp_path / "metrics.json").exists()
+    assert (tmp_path / "map" / "points.ply").exists() and (tmp_path / "report.html").exists()
+
+
+def test_ground_truth_that_cannot_be_written_costs_no_metrics(tmp_path, monkeypatch):
+    write = Trajectory.write_tum
+
+    def fail(trajectory, path):
+        if path.name == "groundtruth.tum":
+            raise OSError("disk is full")
+        write(trajectory, path)
+
+    monkeypatch.setattr(Trajectory, "write_tum", fail)
+    finished = run(config(), tmp_path)
+    assert finished.faults == (
+        "the ground truth could not all be saved: OSError: the disk is full",
+    )
+    assert (tmp_path / "metrics.json").exists()
 
 
 def test_a_module_that_leaves_the_folder_does_not_take_the_results_along(tmp_path, monkeypatch):
