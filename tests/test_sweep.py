@@ -147,6 +147,30 @@ def test_job_whose_configuration_changed_is_run_again(folder):
     assert [row["policy.retry_s"] for row in table(folder / "out")] == ["0", "2"]
 
 
+def ended(sweep, *states):
+    """Give the folders of jobs that ended in these states."""
+    folders = [sweep / str(number) for number in range(len(states))]
+    for folder, state in zip(folders, states, strict=True):
+        folder.mkdir(parents=True)
+        Status(state=state, overrides=[f"a={folder.name}"]).write(folder)
+    return folders
+
+
+@pytest.mark.parametrize(("last", "code"), [(State.DONE, 0), (State.INCOMPLETE, 1)])
+def test_incomplete_job_is_told_by_the_exit_code_and_not_run_again(tmp_path, last, code):
+    folders = ended(tmp_path, State.DONE, last)
+    assert run_sweep(tmp_path, folders, {"backend": "basic"}, tmp_path) is (code == 0)
+    assert main([str(tmp_path)]) == code
+    assert Status.read(folders[1]).state is last
+
+
+def test_table_holds_no_job_of_an_earlier_command(tmp_path, capsys):
+    folders = ended(tmp_path, State.DONE, State.DONE, State.FAILED)
+    run_sweep(tmp_path, folders[:2], {"backend": "basic"}, tmp_path)
+    assert [row["job"] for row in table(tmp_path)] == ["0", "1"]
+    assert main([str(tmp_path)]) == 0 and "2 jobs: 2 done" in capsys.readouterr().out
+
+
 def test_running_sweep_does_not_see_later_edits(folder):
     mine = folder / "mine" / "policy" / "mine.yaml"
     mine.parent.mkdir(parents=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -43,13 +43,17 @@ def read_rows(folder: Path) -> list[Row]:
     """
     if not folder.is_dir():
         raise InputError(f"expected the folder of a sweep, or of runs: {folder}")
-    found = sorted(_runs(folder), key=lambda path: _order(folder, path))
-    rows = [_row(folder, path) for path in found]
+    rows = rows_of(folder, _runs(folder))
     if (folder / ROWS).is_file():
         rows += [Row(**json.loads(line)) for line in (folder / ROWS).read_text().splitlines()]
     if not rows:
         raise InputError(f"no run in the folder: {folder}")
     return rows
+
+
+def rows_of(folder: Path, runs: Iterable[Path]) -> list[Row]:
+    """Return a row for each of the runs below a folder, numbered ones in order."""
+    return [_row(folder, run) for run in sorted(runs, key=lambda path: _order(folder, path))]
 
 
 def swept_keys(rows: Sequence[Row]) -> list[str]:

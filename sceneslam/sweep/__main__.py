@@ -11,7 +11,7 @@ from sceneslam.types.errors import SceneSlamError
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the missing jobs; return the exit code: 0 all finished, 1 not all, 2 no sweep."""
+    """Run the missing jobs; return the exit code: 0 all complete, 1 not all, 2 no sweep."""
     words = sys.argv[1:] if arguments is None else list(arguments)
     if len(words) != 1 or words[0].startswith("-"):
         print("usage: python -m sceneslam.sweep DIR (the folder of a sweep)", file=sys.stderr)

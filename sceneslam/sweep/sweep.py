@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from sceneslam.collect.overview import overview
-from sceneslam.collect.rows import read_rows
+from sceneslam.collect.rows import rows_of
 from sceneslam.collect.status import State, Status
 from sceneslam.collect.write import write_rows
 from sceneslam.interrupts import termination_noted
@@ -29,7 +29,9 @@ _TOLD_ERRORS = 10
 def run_sweep(
     sweep: Path, folders: Sequence[Path], launcher: Mapping[str, Any], began_in: Path
 ) -> bool:
-    """Run the jobs that are not finished; return whether all are. Writes the sweep's table.
+    """Run the jobs that are not finished; return whether all are complete. Writes the table.
+
+    An incomplete job, such as one of damaged input, is finished: another run would give the same.
 
     `launcher` has the name of a backend, in `backend`, and its settings; `began_in` is the base
     folder of relative paths.
@@ -37,7 +39,8 @@ def run_sweep(
     backend = _backend(launcher)
     own = sweep / _OWN
     own.mkdir(parents=True, exist_ok=True)
-    kept = {"launcher": dict(launcher), "began_in": str(began_in)}
+    jobs = [folder.relative_to(sweep).as_posix() for folder in folders]
+    kept = {"launcher": dict(launcher), "began_in": str(began_in), "jobs": jobs}
     with whole(own / _KEPT) as file:
         file.write(json.dumps(kept, indent=2) + "\n")
     stop = own / "stop"
@@ -55,18 +58,18 @@ def run_sweep(
     for folder in missing:
         settle(folder, State.STOPPED, "never began")
     _tell(sweep, folders, skipped=len(folders) - len(missing))
-    return all(map(_is_finished, folders))
+    return all(_status(folder).state is State.DONE for folder in folders)
 
 
 def resume(sweep: Path) -> bool:
-    """Run the missing jobs of a sweep as composed; return whether all are finished then."""
+    """Run the missing jobs of a sweep as composed; return whether all are complete then."""
     path = sweep / _OWN / _KEPT
     if not path.is_file():
         raise InputError(f"not the folder of a sweep (it has no {_OWN}/{_KEPT}): {sweep}")
-    folders = sorted((path.parent for path in sweep.rglob("job.json")), key=_order)
     try:
         kept = json.loads(path.read_text())
         launcher, began_in = dict(kept["launcher"]), Path(kept["began_in"])
+        folders = [sweep / str(name) for name in kept["jobs"]]
     except (ValueError, TypeError, KeyError) as error:
         raise InputError(f"the sweep's file is damaged ({text_of(error)}): {path}") from error
     return run_sweep(sweep, folders, launcher, began_in)
@@ -74,7 +77,9 @@ def resume(sweep: Path) -> bool:
 
 def _tell(sweep: Path, folders: Sequence[Path], *, skipped: int) -> None:
     """Write the sweep's table and page, and print how its jobs ended."""
-    rows = read_rows(sweep)
+    rows = rows_of(sweep, folders)
+    if not rows:
+        raise InputError(f"no run in the folder: {sweep}")
     page = write_rows(sweep, rows)
     print(overview(rows), end="")
     statuses = {folder: _status(folder) for folder in folders}
@@ -105,8 +110,3 @@ def _status(folder: Path) -> Status:
 
 def _is_finished(folder: Path) -> bool:
     return _status(folder).is_finished
-
-
-def _order(folder: Path) -> tuple[int, str]:
-    """Sort numbered folders by their number, others by name."""
-    return (int(folder.name), "") if folder.name.isdecimal() else (sys.maxsize, str(folder))
