@@ -53,11 +53,15 @@ def run_experiment(config: DictConfig, folder: Path) -> Verdict:
     key = str(config.experiment)
     plain = resolved(config)
     check_given(plain.get(key), key)
+    jobs = plain.get("jobs")
+    if not isinstance(jobs, int) or isinstance(jobs, bool):
+        raise ConfigError("jobs", jobs, "a whole number")
+    check_least(1, jobs=jobs)
     experiment = ComponentBuilder(plain).make(key, Experiment)
     folder.mkdir(parents=True, exist_ok=True)
     hydra = HydraConfig.get()
     with tqdm(desc=key, unit="run", leave=False) as bar:
-        trials = _Trials(key, folder / "runs", hydra.overrides.task, int(config.jobs), bar)
+        trials = _Trials(key, folder / "runs", hydra.overrides.task, jobs, bar)
         verdict = experiment.run(trials.run, folder)
     write_verdict(folder, key, verdict)
     save_config(plain, folder / "config.yaml")
@@ -77,7 +81,6 @@ class _Trials:
     def __init__(
         self, key: str, folder: Path, overrides: Sequence[str], jobs: int, bar: Any
     ) -> None:
-        check_least(1, jobs=jobs)
         self._key, self._folder, self._overrides, self._jobs = key, folder, overrides, jobs
         self._bar = bar  # over all runs, as some experiments request them one by one
         self._atlases: dict[str, Mapping[str, Any]] = {}  # by the name of the trial

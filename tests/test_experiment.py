@@ -308,6 +308,9 @@ def test_the_processes_of_a_stopped_experiment_end_with_it_and_lose_nothing(tmp_
     [
         ((), "openloris.path: got nothing"),
         (("openloris.path=data", "jobs=0"), "jobs: got 0"),
+        (("openloris.path=data", "jobs=two"), "jobs: got 'two', allowed: a whole number"),
+        (("openloris.path=data", "jobs=2.5"), "jobs: got 2.5, allowed: a whole number"),
+        (("openloris.path=data", "jobs=true"), "jobs: got True, allowed: a whole number"),
         (("openloris.path=nowhere",), "expected a folder: nowhere"),
         (("openloris.path=data", "openloris.limits_m=null"), "openloris.limits_m: got None"),
         (("openloris.path=data", "policy.confirm_window_s=-1"), "policy.confirm_window_s: got -1"),
