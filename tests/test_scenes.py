@@ -202,6 +202,18 @@ def test_a_feature_that_was_constant_in_training_decides_nothing():
     assert [model.scenes[place] for place in scores.argmax(axis=1)] == ["Bright", "Dark"] * 2
 
 
+@pytest.mark.parametrize("name", ["file/model.yaml", "."])
+def test_model_that_cannot_be_written_is_named_before_a_recording_is_read(
+    folders, tmp_path, capsys, monkeypatch, name
+):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setattr("sceneslam.scenes.__main__.look", None)  # reading fails
+    words = [f"Bright={folders / 'bright_0'}", f"Dark={folders / 'dark_0'}"]
+    assert main(["train", str(tmp_path / name), *words]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("error: ") and str(tmp_path) in said and said.count("\n") == 1
+
+
 def test_model_in_the_home_folder_is_found(model, monkeypatch):
     monkeypatch.setenv("HOME", str(model.parent))
     assert learned(Path("~") / model.name).scenes == learned(model).scenes

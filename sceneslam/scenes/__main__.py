@@ -7,6 +7,7 @@ RUNS` writes time spans with the best module of each, as examples for training.
 from __future__ import annotations
 
 import argparse
+import os
 import shlex
 import sys
 from collections.abc import Sequence
@@ -24,7 +25,7 @@ from sceneslam.scenes.runs import read_runs
 from sceneslam.scenes.score import table, write_sheet
 from sceneslam.scenes.train import Judged, judge, train
 from sceneslam.scenes.words import read_words
-from sceneslam.types.errors import InputError, SceneSlamError
+from sceneslam.types.errors import InputError, SceneSlamError, text_of
 
 # The upper half of grey values depends on the light, the lower half on shadows.
 _FEATURES = "q50,q75,q90,q98"
@@ -47,10 +48,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except SceneSlamError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    except OSError as error:
+        print(f"error: {text_of(error)}", file=sys.stderr)
+        return 2
     return 0
 
 
 def _train(options: argparse.Namespace, words: Sequence[str]) -> None:
+    _check_writable(options.model)
     names = options.features.split(",")
     seen = _look(options, names)
     trained = train(seen, names)
@@ -65,6 +70,18 @@ def _train(options: argparse.Namespace, words: Sequence[str]) -> None:
     ]
     trained.model.write(options.model, comment)
     print(f"model    {options.model} (detector=learned detector.path={options.model})")
+
+
+def _check_writable(path: Path) -> None:
+    """Raise InputError or OSError for a file that cannot be written, before hours are spent on it.
+
+    What is missing of its folder is made.
+    """
+    if path.is_dir():
+        raise InputError(f"model: got {path}, a folder, allowed: a YAML file")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if not os.access(path if path.exists() else path.parent, os.W_OK):
+        raise InputError(f"model: got {path}, allowed: a file that can be written")
 
 
 def _test(options: argparse.Namespace) -> None:
