@@ -25,6 +25,7 @@ from sceneslam.config.check import check_keys, check_maps_apart
 from sceneslam.storage.folder import RunFolder
 from sceneslam.sweep.__main__ import main
 from sceneslam.sweep.backends import Basic, Joblib, Ray, Submitit
+from sceneslam.sweep.snapshot import keep_code
 from sceneslam.sweep.supervise import JobOrder, run_job
 from sceneslam.sweep.sweep import run_sweep
 from sceneslam.types.errors import ConfigError, InputError
@@ -185,6 +186,23 @@ def test_running_sweep_does_not_see_later_edits(folder):
         assert "retry_s: 0.25" in (folder / "out" / job / "config.yaml").read_text()
     (code,) = (folder / "out" / ".sweep" / "code").iterdir()
     assert (code / "sceneslam" / "sweep" / "job.py").is_file()
+
+
+@pytest.mark.parametrize(
+    "name", ["experiments/mine.py", "sceneslam/page.html", "conf/mine.yaml", "modules/mine.py"]
+)
+def test_an_edit_of_whatever_is_copied_makes_another_copy(tmp_path, monkeypatch, name):
+    for part in ("sceneslam", "conf", "modules", "experiments"):
+        (tmp_path / "root" / part).mkdir(parents=True)
+    (tmp_path / "root" / "pyproject.toml").write_text("")
+    places = [str(tmp_path / "root" / "sceneslam"), str(tmp_path / "root")]
+    monkeypatch.setattr("sceneslam.__path__", places)
+    edited = tmp_path / "root" / name
+    edited.write_text("old")
+    first = keep_code(tmp_path / "code")
+    assert keep_code(tmp_path / "code") == first and (first / name).read_text() == "old"
+    edited.write_text("new")
+    assert (keep_code(tmp_path / "code") / name).read_text() == "new"
 
 
 def test_folders_that_collide_are_refused(folder):

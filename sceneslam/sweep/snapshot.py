@@ -2,28 +2,49 @@
 
 from __future__ import annotations
 
+import hashlib
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
 from tempfile import mkdtemp
 
 import sceneslam
-from sceneslam.config.provenance import code_sha256
 
 _BESIDE = ("conf", "modules", "experiments")  # of a checkout; in a wheel they lie inside
+_CACHES = "__pycache__"
 
 
 def keep_code(folder: Path) -> Path:
     """Return the folder, below `folder`, of the copied package; copy it if it is missing."""
-    target = folder / code_sha256()[:12]
+    parts = _parts()
+    target = folder / _sha256(parts)[:12]
     if target.is_dir():
         return target
     folder.mkdir(parents=True, exist_ok=True)
     part = Path(mkdtemp(dir=folder))
-    package, *checkout = [Path(entry) for entry in sceneslam.__path__]
-    shutil.copytree(package, part / "sceneslam")
-    for root in checkout:
-        shutil.copy2(root / "pyproject.toml", part)
-        for name in _BESIDE:
-            shutil.copytree(root / name, part / name)
+    for name, path in parts.items():
+        if path.is_dir():
+            shutil.copytree(path, part / name, ignore=shutil.ignore_patterns(_CACHES))
+        else:
+            shutil.copy2(path, part / name)
     part.rename(target)
     return target
+
+
+def _parts() -> Mapping[str, Path]:
+    """Return what is copied: the name in the copy, and the file or folder."""
+    package, *checkout = [Path(entry) for entry in sceneslam.__path__]
+    beside = {name: root / name for root in checkout for name in ("pyproject.toml", *_BESIDE)}
+    return {"sceneslam": package, **beside}
+
+
+def _sha256(parts: Mapping[str, Path]) -> str:
+    """Return a hash of the names and contents of all that is copied."""
+    digest = hashlib.sha256()
+    for name, path in parts.items():
+        for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
+            if file.is_file() and _CACHES not in file.parts:
+                inner = file.relative_to(path).as_posix()
+                digest.update(f"{name}/{inner} {file.stat().st_size}\n".encode())
+                digest.update(file.read_bytes())
+    return digest.hexdigest()
