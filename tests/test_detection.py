@@ -20,10 +20,11 @@ from sceneslam.app import run
 from sceneslam.config.resolve import resolved
 from sceneslam.detection.features import RecordingFeatures
 from sceneslam.detection.grid import Axis, try_all
-from sceneslam.detection.run import detect
-from sceneslam.types.errors import ConfigError, ModuleError
+from sceneslam.detection.run import _shares, detect
+from sceneslam.types.errors import ConfigError, InputError, ModuleError
 from sceneslam.types.files import AppendedFile
-from sceneslam.types.truth import SceneChange
+from sceneslam.types.observation import SceneVote
+from sceneslam.types.truth import GroundTruth, SceneChange
 
 ROOT = Path(__file__).parents[1]
 TINY = ("story=flicker", "source.camera.size_wh=[80,60]", "source.camera.rate_hz=10")
@@ -103,6 +104,17 @@ def test_grid_gives_what_every_setting_gives_alone(config, tmp_path):
             detect(config(*words, *setting), tmp_path)
             assert json.loads((tmp_path / "metrics.json").read_text()) == one.metrics
     assert sum(bool(one.error) for one in tried) == 5
+
+
+@pytest.mark.parametrize(
+    ("name", "ending"), [("Dark", ", 100.0 % right"), ("Night", ", 50.0 % right"), (None, "")]
+)
+def test_share_of_right_votes_is_said_by_the_names_of_the_truth(name, ending):
+    votes = [SceneVote(stamp_ns=at, scene="Cellar" if at else "Hall") for at in (0, 1)]
+    scenes = (SceneChange(stamp_ns=0, scene="Bright"), SceneChange(stamp_ns=1, scene="Dark"))
+    names = {"Hall": "Bright", "Cellar": name} if name else {"Hall": "Hall", "Cellar": "Cellar"}
+    shares = _shares(votes, GroundTruth(scenes=scenes), names)
+    assert shares == f"Hall 50.0 %, Cellar 50.0 %{ending}"
 
 
 def test_recording_is_read_once_for_all_settings(config, tmp_path, cache, monkeypatch):

@@ -74,6 +74,26 @@ def test_confirm_delay_counts_from_the_true_change_it_answers():
     assert switch["confirm_delay_s"] == pytest.approx(1.5)
 
 
+def named_otherwise(run: RunResult, second_at: int) -> RunResult:
+    """The run with the scene Dark called Cellar, then Tunnel from pose `second_at` on."""
+    names = {"Dark": "Cellar"}
+    events = [
+        {**event, "scene": names.get(event["scene"], event["scene"])} if "scene" in event else event
+        for event in run.events
+    ]
+    stamp_ns = int(stamps(200)[second_at])
+    again = [{**e, "scene": "Tunnel"} for e in switch_events(stamp_ns, stamp_ns) if "scene" in e]
+    return replace(run, events=[*events, *again])
+
+
+def test_confirm_delay_of_a_scene_with_another_name_counts_for_its_first_switch_only():
+    settings = replace(SETTINGS, scenes={"Cellar": "Dark", "Tunnel": "Dark"})
+    run = named_otherwise(switched_run(), second_at=150)
+    first, second = evaluate(run, true_loop(true_at=85), settings=settings)["switches"]
+    assert first["confirm_delay_s"] == pytest.approx(1.5)
+    assert second["confirm_delay_s"] is None
+
+
 def test_switch_to_a_scene_that_is_not_there_is_false():
     scenes = (SceneChange(stamp_ns=START_NS, scene="Bright"),)
     truth = GroundTruth(trajectory=true_loop().trajectory, scenes=scenes)

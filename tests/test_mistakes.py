@@ -40,6 +40,10 @@ BAD = {
     "a scene without a module": ({"scenes__Dark": ...}, "scenes.Dark: got nothing"),
     "an unknown module in the table": ({"scenes__Dark": ["drak"]}, "scenes.Dark: got ['drak']"),
     "an empty list of modules": ({"scenes__Dark": []}, "scenes.Dark: got []"),
+    "a name for a scene that the detector has not": (
+        {"evaluation__scenes": {"Drak": "Night"}},
+        "evaluation.scenes.Drak: got 'Night', allowed: a scene of the detector: Bright, Dark",
+    ),
     "a module twice": ({"scenes__Dark": ["dark", "dark"]}, "scenes.Dark"),
     "an argument of the wrong kind": ({"slam__dark": 7}, "slam.dark: got 7"),
     "a sensor that the source lacks": (

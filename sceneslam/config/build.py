@@ -64,7 +64,7 @@ def build(config: Mapping[str, Any]) -> RunParts:
         known = f"a key of slam that a scene names: {', '.join(modules)}"
         raise ConfigError(f"policy.startup_s.{key}", policy.startup_s[key], known)
     atlas = builder.make("atlas", Atlas)
-    evaluation = builder.make("evaluation", EvaluationSettings)
+    evaluation = make_evaluation(builder, detector)
     sinks = {key: builder.make(f"sinks.{key}", Sink) for key in _group(config, "sinks")}
     source = make_source(config, builder)
     with ExitStack() as opened:  # closed again if it does not fit
@@ -110,6 +110,16 @@ def opened_source(config: Mapping[str, Any], builder: ComponentBuilder) -> Itera
         yield source
     finally:
         _release(source)
+
+
+def make_evaluation(builder: ComponentBuilder, detector: Detector) -> EvaluationSettings:
+    """Return the evaluation; raises ConfigError if it names scenes that the detector has not."""
+    evaluation = builder.make("evaluation", EvaluationSettings)
+    for scene, name in evaluation.scenes.items():
+        if scene not in detector.scenes:
+            known = f"a scene of the detector: {', '.join(detector.scenes)}"
+            raise ConfigError(f"evaluation.scenes.{scene}", name, known)
+    return evaluation
 
 
 def check_detector(config: Mapping[str, Any], detector: Detector, rig: Rig) -> None:

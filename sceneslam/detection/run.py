@@ -11,7 +11,13 @@ from typing import Any
 from sceneslam.bus.policy import Policy
 from sceneslam.bus.scene.scene_filter import ConfirmedScene
 from sceneslam.bus.scene.watch import log_vote
-from sceneslam.config.build import check_detector, check_mode, check_no_map, opened_source
+from sceneslam.config.build import (
+    check_detector,
+    check_mode,
+    check_no_map,
+    make_evaluation,
+    opened_source,
+)
 from sceneslam.config.check import check_keys, check_no_reference
 from sceneslam.config.component import ComponentBuilder
 from sceneslam.config.provenance import save_config
@@ -47,6 +53,7 @@ def watch(config: Mapping[str, Any]) -> Watched:
     builder = ComponentBuilder(config)
     run = builder.make("run", RunSettings)
     detector = builder.make("detector", FeatureDetector)
+    make_evaluation(builder, detector)  # before the recording is read
     with opened_source(config, builder) as source:
         check_mode(run, source)
         rig = source.rig
@@ -72,12 +79,14 @@ def detect(
     folder.mkdir(parents=True, exist_ok=True)
     fault = _write_events(folder / "events.jsonl", results)
     save_config(config, folder / "config.yaml")
-    metrics = score(watched.features, confirmed, builder.make("evaluation", EvaluationSettings))
+    evaluation = make_evaluation(builder, detector)
+    metrics = score(watched.features, confirmed, evaluation)
     write_metrics(folder / "metrics.json", metrics)
+    names = {scene: evaluation.scenes.get(scene, scene) for scene in detector.scenes}
     scores = metrics["detection"]
     lines = [
         f"{metrics['observations']} observations, {scores['confirmed']} scenes confirmed",
-        f"votes: {_shares(votes, watched.features.truth)}",
+        f"votes: {_shares(votes, watched.features.truth, names)}",
         f"false {number(scores['false'], 0)}, missed {number(scores['missed'], 0)}, "
         f"found {number(scores['delay_s'], 2, ' s')} after the change "
         f"(at most {number(scores['delay_max_s'], 2, ' s')}), "
@@ -100,13 +109,18 @@ def score(
     }
 
 
-def _shares(votes: Sequence[SceneVote], truth: GroundTruth | None) -> str:
-    """Return a text with each scene's share of votes, and the share of correct votes."""
+def _shares(votes: Sequence[SceneVote], truth: GroundTruth | None, names: Mapping[str, str]) -> str:
+    """Return a text with each scene's share of votes, and the share of correct votes.
+
+    `names` maps the detector's scenes to the truth's. The correct votes are left out if the truth
+    contains none of the names: it is about other scenes.
+    """
     counts = Counter(one.scene for one in votes)
     shares = [f"{scene} {100 * count / len(votes):.1f} %" for scene, count in counts.most_common()]
     cast = [one for one in votes if one.scene != UNSURE]
-    if truth is not None and cast:
-        right = sum(true_scene(truth, one.stamp_ns) == one.scene for one in cast)
+    true = {change.scene for change in truth.scenes} if truth else set()
+    if truth is not None and cast and true & set(names.values()):
+        right = sum(true_scene(truth, one.stamp_ns) == names.get(one.scene) for one in cast)
         shares.append(f"{100 * right / len(cast):.1f} % right")
     return ", ".join(shares) or "none"
 

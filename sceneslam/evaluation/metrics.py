@@ -49,7 +49,7 @@ def evaluate(
     are sentences on why an expected number is missing; `shortfalls` are sentences on why the run is
     incomplete, which makes the exit code 1.
     """
-    switches = list_switches(result, truth)
+    switches = list_switches(result, truth, settings.scenes)
     detected = {str(e["scene"]) for e in result.events if e["event"] == "scene"}
     metrics: Metrics = {
         **_accuracy(result, truth, settings),

@@ -27,15 +27,18 @@ class Seam:
     after: int  # first pose of the module that took over
 
 
-def list_switches(result: RunResult, truth: GroundTruth | None) -> list[dict[str, Any]]:
+def list_switches(
+    result: RunResult, truth: GroundTruth | None, scenes: Mapping[str, str]
+) -> list[dict[str, Any]]:
     """Return one entry for every decision that replaced a module, for `metrics.json`.
 
     `jump_m` and `jump_rad` are the error of the estimated motion across the seam against the true
     motion, or else the jump that the hand-over measured. None is unknown: a module without a pose
-    before it was replaced has neither jump nor gap.
+    before it was replaced has neither jump nor gap. `confirm_delay_s` is the time since the true
+    change that a switch is the first to answer. `scenes` maps own scenes to the truth's names.
     """
     decisions = [event for event in result.events if is_switch(event)]
-    return [_describe(decision, result, truth) for decision in decisions]
+    return [_describe(decision, result, truth, scenes) for decision in decisions]
 
 
 def count_false(
@@ -115,7 +118,9 @@ def _in_turn(result: RunResult, decision: Event) -> NDArray[np.bool_]:
     return inside
 
 
-def _describe(decision: Event, result: RunResult, truth: GroundTruth | None) -> dict[str, Any]:
+def _describe(
+    decision: Event, result: RunResult, truth: GroundTruth | None, scenes: Mapping[str, str]
+) -> dict[str, Any]:
     handover = _same_stamp(result.events, "handover", decision)
     cost = _same_stamp(result.events, "cost", decision)
     seam = find_seam(result, decision)
@@ -126,7 +131,7 @@ def _describe(decision: Event, result: RunResult, truth: GroundTruth | None) -> 
         "from": decision["from"],
         "to": decision["to"],
         "reason": decision["reason"],
-        "confirm_delay_s": _confirm_delay_s(decision, truth),
+        "confirm_delay_s": _confirm_delay_s(decision, result.events, truth, scenes),
         "gap_s": _gap_s(result, seam) if seam else None,
         "jump_m": jump_m,
         "jump_rad": jump_rad,
@@ -145,12 +150,29 @@ def _same_stamp(events: Sequence[Event], kind: str, decision: Event) -> Event:
     return {}
 
 
-def _confirm_delay_s(decision: Event, truth: GroundTruth | None) -> float | None:
-    """Return the time since the true change that a switch answers, None when it answers none."""
-    if truth is None or decision["reason"] != "scene":
+def _confirm_delay_s(
+    decision: Event,
+    events: Sequence[Event],
+    truth: GroundTruth | None,
+    scenes: Mapping[str, str],
+) -> float | None:
+    """Return the time since the true change that a switch answers, None when it answers none.
+
+    Only the first decision for the new scene answers a change: a later one is for another own name
+    of the same scene, or takes a wrong scene back.
+    """
+    change = _change_in_force(truth, decision["stamp_ns"]) if truth else None
+    if truth is None or change is None or change is truth.scenes[0]:
         return None
-    change = _change_in_force(truth, decision["stamp_ns"])
-    if change is None or change is truth.scenes[0] or change.scene != decision["scene"]:
+    answers = (
+        event
+        for event in events
+        if event["event"] == "decision"
+        and event["reason"] == "scene"
+        and event["stamp_ns"] >= change.stamp_ns
+        and scenes.get(event["scene"], event["scene"]) == change.scene
+    )
+    if next(answers, None) is not decision:
         return None
     return float(decision["stamp_ns"] - change.stamp_ns) * 1e-9
 
