@@ -15,7 +15,7 @@ import numpy as np
 
 from sceneslam.atlas.save import save_map
 from sceneslam.atlas.uncertainty import write_covariances
-from sceneslam.evaluation.metrics import Metrics, evaluate, write_metrics
+from sceneslam.evaluation.metrics import Metrics, evaluate, truth_of_run, write_metrics
 from sceneslam.evaluation.report.run_page import write_report
 from sceneslam.evaluation.settings import EvaluationSettings
 from sceneslam.interfaces import Source
@@ -77,6 +77,7 @@ class Results:
         metrics: Metrics | None
         try:
             metrics = compared(result, truth, reference=reference)
+            truth = truth_of_run(result, truth)
         except Exception as error:  # such as NaN in the ground truth
             _log.info("no comparison", exc_info=error)
             self.faults.append(f"no comparison with the ground truth: {text_of(error)}")

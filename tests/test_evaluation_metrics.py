@@ -13,6 +13,7 @@ from evaluation_runs import (
     loop,
     part_of,
     poseless_run,
+    shaken,
     stamps,
     switched_run,
     true_loop,
@@ -21,12 +22,15 @@ from evaluation_runs import (
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sceneslam.evaluation.accuracy import absolute_errors
 from sceneslam.evaluation.association import interpolated, select
 from sceneslam.evaluation.metrics import coverage, evaluate, write_metrics
 from sceneslam.evaluation.report.story import tell
 from sceneslam.evaluation.report.summary import summary_lines
 from sceneslam.evaluation.settings import EvaluationSettings
+from sceneslam.results import Results
 from sceneslam.types.errors import ConfigError
+from sceneslam.types.trajectory import Trajectory
 from sceneslam.types.truth import GroundTruth
 
 KEYS = {
@@ -148,6 +152,30 @@ def test_pose_before_the_first_true_pose_is_held_against_it():
     early = interpolated(loop(200), stamps(199, START_NS + PERIOD_NS - 4_000_000))
     truth = GroundTruth(trajectory=early)
     assert evaluate(run, truth, settings=SETTINGS)["truth_matched"] == 100
+
+
+def test_error_of_the_saved_truth_is_that_of_the_metrics(tmp_path):
+    def at(count, rate_hz):
+        stamps_ns = START_NS + np.round(np.arange(count) / rate_hz * 1e9).astype(np.int64)
+        return interpolated(loop(1300), stamps_ns)
+
+    estimate = shaken(at(300, 30), 0.02)
+    run = replace(switched_run(300), trajectory=estimate, observed_ns=estimate.stamps_ns)
+    results = Results(
+        folder=tmp_path,
+        config={},
+        versions={},
+        title="",
+        evaluation=replace(SETTINGS, association_gap_s=0.02),
+        has_report=False,
+        value_label="",
+        faults=[],
+        source=None,
+    )
+    metrics = results.save_rest(run, GroundTruth(trajectory=at(2500, 20)))
+    saved = Trajectory.read_tum(tmp_path / "groundtruth.tum")
+    assert saved.stamps_ns[-1] - START_NS < 10.1e9
+    assert absolute_errors(estimate, saved, 0.02).rmse_m == pytest.approx(metrics["ate_rmse_m"])
 
 
 def test_longer_truth_does_not_lower_the_correct_rate():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -84,6 +84,19 @@ def write_metrics(path: Path, metrics: Metrics) -> None:
         file.write(json.dumps(metrics, indent=2, allow_nan=False) + "\n")
 
 
+def truth_of_run(result: RunResult, truth: GroundTruth | None) -> GroundTruth | None:
+    """Return the truth without poses outside the run's time span, which are not used.
+
+    The last pose before it and the first after it stay, and all scenes.
+    """
+    observed_ns = result.observed_ns
+    if truth is None or not len(observed_ns):
+        return truth
+    return replace(
+        truth, trajectory=clip(truth.trajectory, int(observed_ns[0]), int(observed_ns[-1]))
+    )
+
+
 def coverage(result: RunResult) -> float | None:
     """Return the share of observations, from the first pose on, that got a pose."""
     if not len(result.observed_ns):
@@ -99,10 +112,8 @@ def coverage(result: RunResult) -> float | None:
 def _accuracy(
     result: RunResult, truth: GroundTruth | None, settings: EvaluationSettings
 ) -> Metrics:
-    true, observed_ns = truth.trajectory if truth else Trajectory.empty(), result.observed_ns
-    if len(observed_ns):
-        # Ground truth outside the run's time span is not used.
-        true = clip(true, int(observed_ns[0]), int(observed_ns[-1]))
+    known = truth_of_run(result, truth)
+    true = known.trajectory if known else Trajectory.empty()
     estimate, gap_s = result.trajectory, settings.association_gap_s
     absolute = absolute_errors(estimate, true, gap_s)
     relative = relative_errors(estimate, true, gap_s, settings.rpe_interval_s)
@@ -118,7 +129,7 @@ def _accuracy(
         "segment_trans_m": root_mean_square(segments.trans_m),
         "segment_rot_rad": root_mean_square(segments.rot_rad),
         "length_ratio": length_ratio(estimate, true, gap_s),
-        "correct_rate": correct_rate_observed(estimate, true, observed_ns, settings.limits),
+        "correct_rate": correct_rate_observed(estimate, true, result.observed_ns, settings.limits),
         "truth_matched": len(absolute.errors_m),
         "association_gap_s": gap_s,
     }
