@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pytest
+from evaluation_runs import loop, moved
 
 from sceneslam import run
+from sceneslam.compare import figures
 from sceneslam.compare.__main__ import main
-from sceneslam.compare.runs import differing, read_runs
+from sceneslam.compare.runs import Run, differing, read_runs
+from sceneslam.evaluation.association import select
+from sceneslam.evaluation.figures.paths import _true_m
+from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
+from sceneslam.types.trajectory import Trajectory
 
 WORDS = ("+scenario=single", "source=mcap", "run.progress=false", "slam@slam.only=odometry")
 
@@ -28,6 +36,24 @@ def test_a_script_that_asks_for_a_reference_is_refused(tmp_path):
     with pytest.raises(ConfigError, match=r"reference: got .*, allowed: null in a script"):
         run(*WORDS, "source.path=x", "reference={seed:1}", folder=tmp_path / "run")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_truth_is_placed_by_the_first_pose_that_it_covers():
+    first = loop(200)
+    truth = select(moved(first, se3.from_xy_yaw(3.0, 1.0, 2.0)), np.arange(50, 200))
+    assert _true_m(first, truth) == pytest.approx(first.positions_m[50:, :2])
+    later = Trajectory(stamps_ns=truth.stamps_ns + 10**12, T_world_base=truth.T_world_base)
+    assert not len(_true_m(first, later))
+
+
+def test_truth_is_that_of_the_run_to_which_it_is_aligned(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(figures, "draw_paths", lambda path, paths, truth: drawn.append(truth))
+    made = partial(Run, folder=tmp_path, metrics={}, settings={})
+    none = made(name="none", trajectory=Trajectory.empty(), truth=loop(10))
+    some = made(name="some", trajectory=loop(20), truth=loop(20))
+    assert figures.paths(tmp_path / "paths.png", [none, some])
+    assert drawn == [some.truth]
 
 
 def test_a_script_gets_the_run_as_arrays(runs):

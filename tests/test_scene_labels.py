@@ -105,6 +105,21 @@ def test_every_instant_gets_the_module_whose_error_grew_least(runs, tmp_path, ca
     assert '"scenes={eyes:[eyes,laser],laser:[laser,eyes]}"' in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("runs", [True], indirect=True)
+def test_instants_that_the_truth_does_not_cover_get_no_label(runs, tmp_path, capsys):
+    for path in runs.rglob("groundtruth.tum"):  # from 2 s to 7 s, with a gap from 3 s to 4.5 s
+        lines = path.read_text().splitlines(keepends=True)
+        path.write_text("".join(lines[21:32] + lines[46:72]))
+    assert main(["label", str(tmp_path / "labels.yaml"), str(runs)]) == 0
+    (one,) = Labels.read(tmp_path / "labels.yaml").recordings
+    labelled_s = [(span.start_s, span.end_s) for span in one.spans]
+    assert labelled_s == [(3.5, 4.0), (4.0, 4.1), (5.5, 6.0), (6.0, 6.1)]
+    for path in runs.rglob("groundtruth.tum"):
+        path.write_text("".join(path.read_text().splitlines(keepends=True)[:2]))
+    assert main(["label", str(tmp_path / "labels.yaml"), str(runs)]) == 2
+    assert "the ground truth covers none of it" in capsys.readouterr().err
+
+
 def test_labels_count_from_the_first_observation_where_the_poses_begin_later(runs, tmp_path):
     vote = {"event": "vote", "stamp_ns": FIRST_NS - 2 * 10**9, "scene": "Any", "value": None}
     for path in runs.rglob("events.jsonl"):

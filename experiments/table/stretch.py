@@ -10,12 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.evaluation.accuracy import relative_errors
-from sceneslam.evaluation.association import covered, interpolated
+from sceneslam.evaluation.association import TRUTH_GAP_S, covered, interpolated
 from sceneslam.types.experiment import TrialResult
 from sceneslam.types.run import Event
 from sceneslam.types.trajectory import Trajectory
 
-_TRUTH_GAP_S = 0.5  # ground truth is not interpolated over more
 _STAMP_GAP_S = 0.005  # stamps are the recording's own
 
 
@@ -75,7 +74,7 @@ def _measure(
     interval_s: float,
 ) -> Motions:
     inside_ns = observed_ns[_inside(observed_ns, stretch)]
-    known_ns = inside_ns[covered(truth, inside_ns, _TRUTH_GAP_S)]
+    known_ns = inside_ns[covered(truth, inside_ns, TRUTH_GAP_S)]
     true = interpolated(truth, known_ns) if len(known_ns) else Trajectory.empty()
     due = relative_errors(true, true, _STAMP_GAP_S, interval_s)
     told = [

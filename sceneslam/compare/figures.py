@@ -15,9 +15,10 @@ from sceneslam.evaluation.figures.paths import draw_paths
 
 def paths(path: Path, runs: Sequence[Run]) -> bool:
     """Draw all paths from above as a PNG; False if no run has a pose."""
-    if not any(len(run.trajectory) for run in runs):
+    first = next((run for run in runs if len(run.trajectory)), None)
+    if first is None:
         return False
-    draw_paths(path, {run.name: run.trajectory for run in runs}, runs[0].truth)
+    draw_paths(path, {run.name: run.trajectory for run in runs}, first.truth)
     return True
 
 

@@ -8,12 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.evaluation.alignment import align
-from sceneslam.evaluation.association import covered, interpolated, select
+from sceneslam.evaluation.association import TRUTH_GAP_S, covered, interpolated, select
 from sceneslam.evaluation.path import driven_m
 from sceneslam.types import se3
 from sceneslam.types.trajectory import Trajectory
 
-_TRUTH_GAP_S = 0.5  # ground truth is not interpolated over more
 _POSE_GAP_NS = 10**9  # longest time that one pose counts
 
 
@@ -61,7 +60,7 @@ def correct_rate_observed(
     covers counts: time without observations or ground truth is left out, and a run that is correct
     at each observation gets 1. NaN when there is no such time.
     """
-    known = covered(truth, observed_ns, _TRUTH_GAP_S)
+    known = covered(truth, observed_ns, TRUTH_GAP_S)
     begins = known[:-1][np.diff(known) == 1]
     lasts_ns = observed_ns[begins + 1] - observed_ns[begins]
     if not lasts_ns.sum():
@@ -76,7 +75,7 @@ def correct_rate_observed(
 
 
 def _judge(estimate: Trajectory, truth: Trajectory, limits: CorrectLimits) -> _Judged:
-    index = covered(truth, estimate.stamps_ns, _TRUTH_GAP_S)
+    index = covered(truth, estimate.stamps_ns, TRUTH_GAP_S)
     if not len(index):
         return _Judged(stamps_ns=np.zeros(0, np.int64), is_correct=np.zeros(0, bool))
     matched = select(estimate, index)

@@ -10,13 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.evaluation.association import covered, interpolated
+from sceneslam.evaluation.association import TRUTH_GAP_S, covered, interpolated
 from sceneslam.types import se3
 from sceneslam.types.run import Event, RunResult
 from sceneslam.types.se3 import Transform
 from sceneslam.types.truth import GroundTruth, SceneChange
-
-_TRUTH_GAP_S = 0.5  # ground truth is not interpolated over more
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -212,7 +210,7 @@ def _motion_error(result: RunResult, truth: GroundTruth | None, seam: Seam) -> T
         return None
     ends = [seam.before, seam.after]
     stamps_ns = result.trajectory.stamps_ns[ends]
-    if len(covered(truth.trajectory, stamps_ns, _TRUTH_GAP_S)) < 2:
+    if len(covered(truth.trajectory, stamps_ns, TRUTH_GAP_S)) < 2:
         return None
     T_gt_before, T_gt_after = interpolated(truth.trajectory, stamps_ns).T_world_base
     T_map_before, T_map_after = result.trajectory.T_world_base[ends]

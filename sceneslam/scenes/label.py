@@ -96,7 +96,8 @@ def label(runs: Sequence[ModuleRun], change_m: float) -> Labels:
     """Return the labels of all recordings of the runs.
 
     Among all sequences of modules, the one with the smallest error is chosen; each change of module
-    adds `change_m` [m]. Raises InputError if a recording has one module only.
+    adds `change_m` [m]. Instants that the ground truth does not cover get no label. Raises
+    InputError if a recording has one module only, or its ground truth covers no instant.
     """
     keys = sorted({run.module for run in runs})
     recordings, drifts = [], []
@@ -104,10 +105,13 @@ def label(runs: Sequence[ModuleRun], change_m: float) -> Labels:
         group = list(found)
         stamps_ns = _instants_ns(group)
         drift_mps = _drifts_mps(group, keys, stamps_ns)
-        best = cheapest(drift_mps * STEP_S, change_m)
+        is_known = ~np.isnan(drift_mps).any(axis=1)
+        if not is_known.any():
+            raise InputError(f"runs: the ground truth covers none of it: {group[0].folder}")
+        best = cheapest(np.where(is_known[:, None], drift_mps * STEP_S, 0.0), change_m)
         start_s = (int(stamps_ns[0]) - min(run.first_ns for run in group)) * 1e-9
         recordings.append(_labelled(group[0], keys, best, drift_mps, start_s=start_s))
-        drifts.append(np.column_stack([best, drift_mps]))
+        drifts.append(np.column_stack([best, drift_mps])[is_known])
     return Labels(recordings=recordings, table=_table(keys, np.concatenate(drifts)))
 
 
@@ -152,7 +156,7 @@ def _instants_ns(group: Sequence[ModuleRun]) -> NDArray[np.int64]:
 def _drifts_mps(
     group: Sequence[ModuleRun], keys: Sequence[str], stamps_ns: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Return (N, K) the modules' drift [m/s]; inf for a module that was not run."""
+    """Return (N, K) the modules' drift [m/s]; inf for a module that was not run, NaN unknown."""
     drift_mps = np.full((len(stamps_ns), len(keys)), np.inf)
     for run in group:
         drift_mps[:, keys.index(run.module)] = run.drift_mps(stamps_ns)
@@ -171,9 +175,13 @@ def _labelled(
     group = str(source.get("path") or source.get("story") or source["_target_"])
     gains_m = _gains_mps(best, drift_mps) * STEP_S
     per_second = round(1.0 / STEP_S)
+    known = np.flatnonzero(~np.isnan(drift_mps).any(axis=1))
+    gaps = known - np.arange(len(known))  # the same for instants without a gap between them
+    columns = (best[known], known // per_second, gaps, known)
+    keyed = zip(*(column.tolist() for column in columns), strict=True)
     spans = []
-    for (place, _), found in groupby(enumerate(best), key=lambda at: (at[1], at[0] // per_second)):
-        inside = [at for at, _ in found]
+    for (place, *_), found in groupby(keyed, key=lambda one: one[:3]):
+        inside = [at for *_, at in found]
         spans.append(
             BestModuleSpan(
                 start_s=round(start_s + inside[0] * STEP_S, 3),

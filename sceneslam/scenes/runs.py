@@ -12,7 +12,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from sceneslam.evaluation.association import interpolated
+from sceneslam.evaluation.association import TRUTH_GAP_S, covered, interpolated
 from sceneslam.types import se3
 from sceneslam.types.errors import InputError
 from sceneslam.types.input_files import read_text
@@ -52,7 +52,7 @@ class ModuleRun:
         """Return the drift (N,) [m/s]: growth of its error around each stamp.
 
         It is computed by the ground truth or, without it, by the growth of the module's variance.
-        It is 1 m/s while the module is lost.
+        It is 1 m/s while the module is lost, and NaN where the ground truth does not cover it.
         """
         half_ns = round(_SPAN_S / 2 * 1e9)
         first_ns, last_ns = self.estimate.stamps_ns[[0, -1]]
@@ -70,7 +70,12 @@ class ModuleRun:
     def _errors(
         self, truth: Trajectory, before_ns: NDArray[np.int64], after_ns: NDArray[np.int64]
     ) -> NDArray[np.float64]:
-        """Return the errors (N,) [m] of the motions between pairs of stamps."""
+        """Return the errors (N,) [m] of the motions between pairs of stamps, NaN without truth."""
+        known = np.intersect1d(
+            covered(truth, before_ns, TRUTH_GAP_S), covered(truth, after_ns, TRUTH_GAP_S)
+        )
+        errors_m = np.full(len(before_ns), np.nan)
+        before_ns, after_ns = before_ns[known], after_ns[known]
         T_estimated, T_true = (
             se3.inverse(interpolated(one, before_ns).T_world_base)
             @ interpolated(one, after_ns).T_world_base
@@ -78,7 +83,8 @@ class ModuleRun:
         )
         T_error = se3.inverse(T_true) @ T_estimated
         turned_m = _LEVER_M * se3.rotation_angle_rad(T_error)
-        return np.asarray(np.linalg.norm(T_error[:, :3, 3], axis=1) + turned_m)
+        errors_m[known] = np.linalg.norm(T_error[:, :3, 3], axis=1) + turned_m
+        return errors_m
 
     def _growth(
         self, before_ns: NDArray[np.int64], after_ns: NDArray[np.int64]

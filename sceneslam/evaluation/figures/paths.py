@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.evaluation.association import interpolated
+from sceneslam.evaluation.association import TRUTH_GAP_S, covered, interpolated
 from sceneslam.evaluation.figures import style as look
 from sceneslam.types import se3
 from sceneslam.types.trajectory import Trajectory
@@ -20,7 +20,8 @@ _STYLES = ("-", "--", "-.")
 def draw_paths(path: Path, paths: Mapping[str, Trajectory], truth: Trajectory | None) -> None:
     """Write a PNG with every path from above, in `map`; the true one is dashed.
 
-    The truth is aligned to the first trajectory by its first pose only.
+    The truth is aligned to the first trajectory by one pose only: the first that the truth covers.
+    It is not drawn if it covers none.
     """
     first = next((one for one in paths.values() if len(one)), Trajectory.empty())
     true_m = _true_m(first, truth)
@@ -51,8 +52,9 @@ def draw_paths(path: Path, paths: Mapping[str, Trajectory], truth: Trajectory | 
 
 def _true_m(first: Trajectory, truth: Trajectory | None) -> NDArray[np.float64]:
     """Return the true positions (N, 2) [m] in the frame of a trajectory."""
-    if truth is None or not len(truth) or not len(first):
+    known = covered(truth, first.stamps_ns, TRUTH_GAP_S)[:1] if truth is not None else []
+    if truth is None or not len(known):
         return np.zeros((0, 2))
-    T_gt_first = interpolated(truth, first.stamps_ns[:1]).T_world_base[0]
-    T_map_gt = first.T_world_base[0] @ se3.inverse(T_gt_first)
+    T_gt_known = interpolated(truth, first.stamps_ns[known]).T_world_base[0]
+    T_map_gt = first.T_world_base[known[0]] @ se3.inverse(T_gt_known)
     return np.asarray(se3.apply(T_map_gt, truth.positions_m)[:, :2])
