@@ -99,6 +99,14 @@ def test_summary_has_means_over_seeds_with_intervals(sweep):
     assert float(first["ate_rmse_m ±"]) == pytest.approx(4.3027 * 0.01 / np.sqrt(3), rel=1e-4)
 
 
+def test_summary_says_how_many_runs_a_mean_is_over(sweep):
+    main([str(sweep)])
+    page = (sweep / "index.html").read_text()
+    first, second = table(sweep / "summary.csv")
+    assert (first["ate_rmse_m runs"], second["ate_rmse_m runs"]) == ("3", "2")
+    assert page.count(" (2 of 3)</td>") == 5 and "(3 of 3)" not in page
+
+
 @pytest.mark.parametrize(
     ("freedom", "t"),
     [(1, 12.7062), (2, 4.3027), (3, 3.1824), (4, 2.7764), (9, 2.2622), (30, 2.0423)],

@@ -49,14 +49,14 @@ def _summary(groups: Sequence[Group]) -> str:
         [
             *(_cell(value) for value in group.keys.values()),
             _cell(len(group.rows)),
-            *(_mean_cell(group.mean(name)) for name in metrics),
+            *(_mean_cell(group.mean(name), len(group.rows)) for name in metrics),
         ]
         for group in groups
     ]
     heads = [*((key, False) for key in (*groups[0].keys, "runs", *metrics))]
     return (
-        "<h2>Means over seeds</h2><p class=muted>With 95 % confidence intervals (Student's t).</p>"
-        + _html_table(heads, body)
+        "<h2>Means over seeds</h2><p class=muted>With 95 % confidence intervals (Student's t). "
+        "Where fewer runs have a number, it is the mean over those.</p>" + _html_table(heads, body)
     )
 
 
@@ -116,11 +116,12 @@ def _cell(value: Value, *, more: bool = False) -> str:
     return f'<td{hidden} data-v="{value!r}">{_rounded(value)}</td>'
 
 
-def _mean_cell(mean: Mean | None) -> str:
+def _mean_cell(mean: Mean | None, runs: int) -> str:
     if mean is None:
         return "<td></td>"
     width = "" if mean.half_width is None else f" ± {mean.half_width:.2g}"
-    return f'<td data-v="{mean.mean!r}">{_rounded(mean.mean)}{width}</td>'
+    fewer = "" if mean.count == runs else f" ({mean.count} of {runs})"
+    return f'<td data-v="{mean.mean!r}">{_rounded(mean.mean)}{width}{fewer}</td>'
 
 
 def _rounded(value: float) -> str:

@@ -59,7 +59,10 @@ def _table(rows: Sequence[Row], keys: Sequence[str], *, metrics: bool) -> Column
 
 
 def _summary(groups: Sequence[Group]) -> ColumnTable:
-    """Return one row per setting: number of runs, each metric's mean and 95 % interval."""
+    """Return one row per setting: number of runs, each metric's mean, 95 % interval and count.
+
+    A run without the metric, such as one that failed, does not count.
+    """
     columns: dict[str, Sequence[Value]] = {
         key: [group.keys[key] for group in groups] for key in groups[0].keys
     }
@@ -69,6 +72,7 @@ def _summary(groups: Sequence[Group]) -> ColumnTable:
         means = [group.mean(name) for group in groups]
         columns[name] = [one.mean if one else None for one in means]
         columns[f"{name} ±"] = [one.half_width if one else None for one in means]
+        columns[f"{name} runs"] = [one.count if one else 0 for one in means]
     return ColumnTable(columns=columns)
 
 
