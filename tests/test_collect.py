@@ -91,6 +91,14 @@ def test_parquet_holds_the_table(sweep):
     assert errors[:5] == [float(row["ate_rmse_m"]) for row in rows[:5]] and errors[5] is None
 
 
+def test_report_of_a_folder_with_signs_of_addresses_in_its_name_is_linked(sweep):
+    path = job(sweep, "50 % #2", error_m=0.1)
+    (path / "report.html").write_text("")
+    main([str(sweep)])
+    page = (sweep / "index.html").read_text()
+    assert '<a href="50%20%25%20%232/report.html">50 % #2</a>' in page
+
+
 def test_summary_has_means_over_seeds_with_intervals(sweep):
     main([str(sweep)])
     first, second = table(sweep / "summary.csv")

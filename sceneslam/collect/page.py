@@ -11,7 +11,7 @@ from sceneslam.collect.curves import charts
 from sceneslam.collect.overview import FIRST
 from sceneslam.collect.rows import Row, Value, swept_keys
 from sceneslam.collect.summary import Group, Mean
-from sceneslam.evaluation.report.markup import bullets, tiles
+from sceneslam.evaluation.report.markup import bullets, link, tiles
 from sceneslam.evaluation.report.page import fill_page
 
 _ROWS_MAX = 2000
@@ -98,13 +98,9 @@ def _html_table(heads: Sequence[tuple[str, bool]], body: Sequence[Sequence[str]]
 
 
 def _link(folder: Path, row: Row) -> str:
-    report = folder / row.name / "report.html"
-    name = escape(row.name)
-    return (
-        f'<td><a href="{name}/report.html">{name}</a></td>'
-        if report.is_file()
-        else (f"<td>{name}</td>")
-    )
+    if not (folder / row.name / "report.html").is_file():
+        return _cell(row.name)
+    return f"<td>{link(f'{row.name}/report.html', row.name)}</td>"
 
 
 def _cell(value: Value, *, more: bool = False) -> str:
