@@ -26,6 +26,7 @@ RULES = {
 
 
 def detector(rules=RULES, features=FEATURES, hysteresis_ratio=0.0, otherwise="Bright", **settings):
+    settings = {"hold_s": 0.0, "values": {}, "skip_absent_sensors": False, **settings}
     found = Rules(features, rules, otherwise, hysteresis_ratio, **settings)
     found.activate(Rig(sensors=frozenset()))
     return found
@@ -193,13 +194,11 @@ def test_rules_share_a_named_value():
         "dark": {"scene": "Dark", "when": {"grey_mean": [None, "dim"]}},
         "light": {"scene": "Light", "when": {"grey_mean": ["dim", None]}},
     }
-    settings = {"features": FEATURES, "rules": rules, "otherwise": None, "hysteresis_ratio": 0.0}
     for dim, scene in ((50.0, "Light"), (80.0, "Dark")):
-        found = Rules(**settings, values={"dim": dim})
-        found.activate(Rig(sensors=frozenset()))
+        found = detector(rules=rules, otherwise=None, values={"dim": dim})
         assert found.get_scene(seen(60, 0.0)).scene == scene
     with pytest.raises(ConfigError, match="one of values: dam"):
-        Rules(**settings, values={"dam": 1.0})
+        detector(rules=rules, otherwise=None, values={"dam": 1.0})
 
 
 def test_votes_tell_what_was_measured():

@@ -167,6 +167,8 @@ def test_sensors_that_never_measure_at_the_same_stamp_are_judged_together():
         otherwise="Bright",
         hysteresis_ratio=0.0,
         hold_s=0.5,
+        values={},
+        skip_absent_sensors=False,
     )
     one.activate(RIG)
     votes = []

@@ -63,9 +63,9 @@ class Rules:
         rules: dict[str, dict[str, Any] | None],
         otherwise: str | None,
         hysteresis_ratio: float,
-        hold_s: float = 0.0,
-        values: dict[str, float] | None = None,
-        skip_absent_sensors: bool = False,
+        hold_s: float,
+        values: dict[str, float],
+        skip_absent_sensors: bool,
     ) -> None:
         _check_features(features)
         if not 0 <= hysteresis_ratio < 1:
@@ -80,7 +80,7 @@ class Rules:
         self._features = tuple(features)
         self._hold_ns = round(hold_s * 1e9)
         self._skips = skip_absent_sensors
-        self._values = dict(values or {})
+        self._values = dict(values)
         self._rules = [self._read(f"rules.{name}", rule) for name, rule in used.items()]
         self._present = self._rules  # rules whose sensors the rig has ...
         self._told = list(range(len(self._features)))  # ... and the features that votes report
@@ -131,11 +131,11 @@ class Rules:
 
     def decide(self, stamp_ns: int, features: NDArray[np.float64] | None) -> SceneVote:
         """Return the vote for features (F,); UNSURE if an earlier rule has a missing feature."""
-        scene = UNSURE if features is None else self._first(features)
-        if scene != UNSURE:
-            self._voted = scene
         if features is None:
             return SceneVote(stamp_ns=stamp_ns, scene=UNSURE)
+        scene = self._first(features)
+        if scene != UNSURE:
+            self._voted = scene
         measured = {self._features[index]: float(features[index]) for index in self._told}
         return SceneVote(stamp_ns=stamp_ns, scene=scene, features=measured)
 
