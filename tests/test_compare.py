@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from evaluation_runs import loop, moved
 from sceneslam import run
 from sceneslam.compare import figures
 from sceneslam.compare.__main__ import main
+from sceneslam.compare.page import measured
 from sceneslam.compare.runs import Run, differing, read_runs
 from sceneslam.evaluation.association import select
 from sceneslam.evaluation.figures.paths import _true_m
@@ -54,6 +56,16 @@ def test_truth_is_that_of_the_run_to_which_it_is_aligned(tmp_path, monkeypatch):
     some = made(name="some", trajectory=loop(20), truth=loop(20))
     assert figures.paths(tmp_path / "paths.png", [none, some])
     assert drawn == [some.truth]
+
+
+def test_runs_are_apart_by_the_poses_within_their_own_association_gap(runs):
+    first, second = read_runs([one.folder for one in runs])
+    later = second.trajectory.stamped(second.trajectory.stamps_ns + 20_000_000)
+    names = []
+    for gap_s in (0.01, 0.03):
+        metrics = {**second.metrics, "association_gap_s": gap_s}
+        names.append(measured([first, replace(second, trajectory=later, metrics=metrics)])[-1][0])
+    assert names[0] != names[1] == f"largest distance from {first.name}"
 
 
 def test_a_script_gets_the_run_as_arrays(runs):

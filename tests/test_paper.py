@@ -156,7 +156,7 @@ def test_an_ordered_switch_changes_nothing_before_it_and_little_after(
     def tell(trial):
         asked[trial.name] = trial.values
         trajectory = path if trial.name == "unswitched" else aside
-        metrics = {"ate_rmse_m": 0.01, "ate_max_m": 0.02}
+        metrics = {"ate_rmse_m": 0.01, "ate_max_m": 0.02, "association_gap_s": 0.01}
         return Told(metrics=metrics, trajectory=trajectory, truth=path)
 
     experiment = OrderedSwitchExperiment(
@@ -194,7 +194,7 @@ def test_difference_is_the_largest_between_the_two_runs(tmp_path, offset_m, hold
 
     def tell(trial):
         trajectory = aside if trial.name.endswith("unswitched") else path
-        return Told(metrics={"ate_rmse_m": 0.01}, trajectory=trajectory)
+        return Told(metrics={"ate_rmse_m": 0.01, "association_gap_s": 0.01}, trajectory=trajectory)
 
     experiment = DifferenceExperiment(lit_module="bright", difference_max_m={"one": 0.03})
     verdict = experiment.run(teller(tmp_path / "runs", tell), tmp_path)

@@ -34,7 +34,15 @@ LIMIT_BYTES = 150_000
 
 
 def draw(folder, run, truth, **more):
-    drawn = write_figures(folder, run, truth, threshold=100.0, limits={"light": [55.0]}, **more)
+    drawn = write_figures(
+        folder,
+        run,
+        truth,
+        threshold=100.0,
+        limits={"light": [55.0]},
+        association_gap_s=0.01,
+        **more,
+    )
     assert all(figure.png.stat().st_size < LIMIT_BYTES for figure in drawn)
     assert all(len(figure.svg) < 3 * LIMIT_BYTES for figure in drawn)
     return [figure.name for figure in drawn]

@@ -36,7 +36,10 @@ class DifferenceExperiment:
             for name, overrides in (("switched", ()), ("unswitched", ("lights=on", table)))
         )
         pairs = dict(zip(self._stories, zip(outcomes, outcomes, strict=True), strict=True))
-        found = {name: compare(a.trajectory, b.trajectory) for name, (a, b) in pairs.items()}
+        found = {
+            name: compare(a.trajectory, b.trajectory, a.metrics["association_gap_s"])
+            for name, (a, b) in pairs.items()
+        }
         draw_differences(folder / "difference.png", found)
         figures = [
             Figure.at_most(

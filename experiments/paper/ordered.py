@@ -55,7 +55,8 @@ class OrderedSwitchExperiment:
         of = dict(zip(self._switched, outcomes, strict=True))
         paths = {name: one.trajectory for name, one in {_KEPT: kept, **of}.items()}
         draw_paths(folder / "paths.png", paths, truth)
-        apart = {name: compare(one.trajectory, kept.trajectory) for name, one in of.items()}
+        gap_s = kept.metrics["association_gap_s"]
+        apart = {name: compare(one.trajectory, kept.trajectory, gap_s) for name, one in of.items()}
         before = {name: self._before(one, kept) for name, one in of.items()}
         rows = [_row(name, of[name], before[name], apart[name]) for name in of]
         rows.append((_KEPT, None, None, None, *_errors_cm(kept)))
@@ -71,7 +72,7 @@ class OrderedSwitchExperiment:
         stamps_ns = switched.online.stamps_ns
         ordered_ns = stamps_ns[0] + round(self._at_s * 1e9)
         until = select(switched.online, np.flatnonzero(stamps_ns < ordered_ns))
-        return compare(until, kept.online).max_m
+        return compare(until, kept.online, kept.metrics["association_gap_s"]).max_m
 
     def _figures(
         self, before: Mapping[str, float], apart: Mapping[str, Difference]

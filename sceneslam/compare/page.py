@@ -36,7 +36,10 @@ _MEASURES: Sequence[_Measure] = (  # the measures of each run
 def measured(runs: Sequence[Run]) -> list[list[str]]:
     """Return a row per measure: its name, then a value per run."""
     rows = [[name, *(tell(run.metrics) for run in runs)] for name, tell in _MEASURES]
-    apart = [compare(run.trajectory, runs[0].trajectory) for run in runs[1:]]
+    apart = [
+        compare(run.trajectory, runs[0].trajectory, run.metrics["association_gap_s"])
+        for run in runs[1:]
+    ]
     if any(len(one.stamps_ns) for one in apart):
         name = f"largest distance from {runs[0].name}"
         far = [number(one.max_m if len(one.stamps_ns) else None, 3, " m") for one in apart]

@@ -30,8 +30,8 @@ class Difference:
         return root_mean_square(self.differences_m)
 
 
-def compare(trajectory: Trajectory, reference: Trajectory, max_gap_s: float = 0.01) -> Difference:
-    """Return the distance of poses with the same stamp, directly in `map`.
+def compare(trajectory: Trajectory, reference: Trajectory, max_gap_s: float) -> Difference:
+    """Return the distance of poses within `max_gap_s` of each other, directly in `map`.
 
     There is no alignment: both runs start at the identity at the same place.
     """

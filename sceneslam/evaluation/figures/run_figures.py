@@ -46,9 +46,9 @@ def write_figures(
     *,
     threshold: float | None,
     limits: Limits,
+    association_gap_s: float,
     value_label: str = "detector value",
     reference: Trajectory | None = None,
-    association_gap_s: float = 0.01,
     faults: list[str] | None = None,
 ) -> list[Drawn]:
     """Write all figures of a run; return them in the report's order.
