@@ -38,6 +38,7 @@ KEYS = {
     "ate_max_m",
     "rpe_trans_m",
     "rpe_rot_rad",
+    "rpe_interval_s",
     "ate_rot_rad",
     "segment_trans_m",
     "segment_rot_rad",

@@ -1,5 +1,6 @@
 """A run told in a few lines and in plain sentences."""
 
+import re
 from dataclasses import replace
 
 from evaluation_runs import (
@@ -68,3 +69,7 @@ def test_dropped_observations_are_told_when_there_are_some():
     assert "45 more were dropped" in told
     assert "dropped" not in " ".join(summary_of(switched_run()))
     assert "dropped" not in " ".join(tell(evaluate(switched_run(), None, settings=SETTINGS)))
+
+
+def test_largest_error_has_its_unit():
+    assert re.search(r"ATE 0\.\d{4} m \(max 0\.\d{3} m\)", "\n".join(summary_of(switched_run())))

@@ -26,7 +26,7 @@ from sceneslam.evaluation.figures.features import feature_limits
 from sceneslam.evaluation.figures.run_figures import write_figures
 from sceneslam.evaluation.figures.time import draw_timeline
 from sceneslam.evaluation.metrics import evaluate
-from sceneslam.evaluation.report.run_page import write_report
+from sceneslam.evaluation.report.run_page import _numbers, write_report
 from sceneslam.types.run import KeyMoment, RunResult
 from sceneslam.types.truth import GroundTruth
 
@@ -237,6 +237,13 @@ def test_report_tells_what_happened_in_words(tmp_path):
     assert "At 10.0 s “laser” took over from “rgbd”" in html
     assert "the scene was confirmed to be Dark, 2.00 s after it really changed" in html
     assert "<td>3.5 ms</td>" in html
+
+
+def test_report_tells_over_which_time_the_motion_is_compared(tmp_path):
+    metrics = evaluate(switched_run(), true_loop(), settings=replace(SETTINGS, rpe_interval_s=2.5))
+    shown = _numbers(metrics)
+    assert "error of the motion over 2.5 s" in shown and "error over 2.5 s" in shown
+    assert "over 1 s" not in shown
 
 
 def test_report_tells_how_many_observations_were_dropped(tmp_path):

@@ -125,6 +125,7 @@ def _accuracy(
         "ate_rot_rad": rotation_rmse_rad(estimate, true, gap_s),
         "rpe_trans_m": root_mean_square(relative.trans_m),
         "rpe_rot_rad": root_mean_square(relative.rot_rad),
+        "rpe_interval_s": settings.rpe_interval_s,
         "segment_m": settings.segment_m,
         "segment_trans_m": root_mean_square(segments.trans_m),
         "segment_rot_rad": root_mean_square(segments.rot_rad),

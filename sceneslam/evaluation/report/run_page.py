@@ -154,6 +154,7 @@ def _plain_values(node: Mapping[str, Any]) -> str:
 
 def _numbers(metrics: Metrics) -> str:
     online_m = metrics["ate_online_m"]
+    over = f"over {metrics['rpe_interval_s']:g} s"
     entries = {
         "position error, root mean square (ATE)": number(metrics["ate_rmse_m"], 4, " m"),
         "the same, as reported online": number(online_m, 4, " m"),
@@ -163,8 +164,8 @@ def _numbers(metrics: Metrics) -> str:
             metrics["segment_trans_m"], 3, " m"
         ),
         "estimated over true length": number(metrics["length_ratio"], 4),
-        "error of the motion over 1 s": number(metrics["rpe_trans_m"], 4, " m"),
-        "turn's error over 1 s": degrees(metrics["rpe_rot_rad"]),
+        f"error of the motion {over}": number(metrics["rpe_trans_m"], 4, " m"),
+        f"turn's error {over}": degrees(metrics["rpe_rot_rad"]),
         "of the time correct": percent(metrics["correct_rate"]),
         "of observations with a pose": percent(metrics["coverage"]),
         "switches": str(len(metrics["switches"])),

@@ -96,7 +96,7 @@ def _faults_line(faults: list[str]) -> str:
 def _accuracy_line(metrics: Metrics) -> str:
     return (
         f"against ground truth: ATE {number(metrics['ate_rmse_m'], 4, ' m')} "
-        f"(max {number(metrics['ate_max_m'], 3)}), "
+        f"(max {number(metrics['ate_max_m'], 3, ' m')}), "
         f"rotation {degrees(metrics['ate_rot_rad'])}, "
         f"RPE {number(metrics['rpe_trans_m'], 4, ' m')} {degrees(metrics['rpe_rot_rad'])}, "
         f"correct {percent(metrics['correct_rate'])}, "
