@@ -272,6 +272,8 @@ def test_comparison_aligns_nothing():
         ("1 2 3\n", "line 1: expected"),
         ("1 2 3 4 5 6 7 8 9 10 11 nan\n", "twelve finite numbers"),
         ("1 2 3 4 5 6 7 8 9 10 11 12\n1 2\n", "twelve numbers"),
+        ("1 0 0 5 0 1 0 6 0 0 1 7\n2 0 0 5 0 2 0 6 0 0 2 7\n", "pose 2: .* no rotation"),
+        ("1 0 0 5 0 1 0 6 0 0 -1 7\n", "pose 1: .* no rotation"),
     ],
 )
 def test_broken_trajectory_files_are_named_in_one_sentence(tmp_path, text, complaint):

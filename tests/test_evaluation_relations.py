@@ -89,9 +89,17 @@ def test_command_line_prints_json(shared_data, capsys):
     assert scores["matched"] == 2174
 
 
+@pytest.mark.parametrize("gap_s", ["nan", "inf", "-1", "1e300"])
+def test_gap_that_is_no_time_is_refused(tmp_path, capsys, gap_s):
+    four_poses().write_tum(tmp_path / "poses.tum")
+    words = [f"{tmp_path}/poses.tum", f"{tmp_path}/poses.tum", "--max-gap-s", gap_s]
+    assert main(["ate", *words]) == 2
+    assert capsys.readouterr().err.startswith("error: --max-gap-s: got ")
+
+
 def test_command_line_prints_relation_errors(tmp_path, capsys):
     four_poses().write_tum(tmp_path / "poses.tum")
-    (tmp_path / "x.relations").write_text("0 1 0.1 0 0 0 0 0.2\n")
+    (tmp_path / "x.relations").write_text(" # t1 t2 x y z r p y\n0 1 0.1 0 0 0 0 0.2\n")
     assert main(["relations", f"{tmp_path}/poses.tum", f"{tmp_path}/x.relations"]) == 0
     scores = json.loads(capsys.readouterr().out)
     assert scores["trans_mean_m"] == pytest.approx(0.0, abs=1e-8)

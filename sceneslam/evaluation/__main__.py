@@ -11,7 +11,7 @@ from pathlib import Path
 from sceneslam.evaluation.accuracy import absolute_errors, relative_errors, root_mean_square
 from sceneslam.evaluation.files import read_poses
 from sceneslam.evaluation.relations import Relations, relation_errors
-from sceneslam.types.errors import InputError, SceneSlamError
+from sceneslam.types.errors import ConfigError, InputError, SceneSlamError
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -27,6 +27,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _ate(options: argparse.Namespace) -> dict[str, float | int | None]:
+    if not 0 <= options.max_gap_s <= 1e9:
+        raise ConfigError("--max-gap-s", options.max_gap_s, "0 to 1e9 [s]")
     estimate, truth = read_poses(options.estimate), read_poses(options.truth)
     absolute = absolute_errors(estimate, truth, options.max_gap_s)
     if not len(absolute.errors_m):

@@ -5,9 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sceneslam.types.errors import InputError
 from sceneslam.types.trajectory import Trajectory
+
+_ROTATION_TOLERANCE = 1e-3  # files print six digits or more
 
 
 def read_poses(path: Path) -> Trajectory:
@@ -27,7 +30,7 @@ def read_poses(path: Path) -> Trajectory:
 
 def _first_line(path: Path) -> str:
     with path.open(errors="replace") as file:
-        return next((line for line in file if line.strip() and not line.startswith("#")), "")
+        return next((line for line in file if line.strip() and line.lstrip()[0] != "#"), "")
 
 
 def _read_kitti(path: Path) -> Trajectory:
@@ -39,5 +42,15 @@ def _read_kitti(path: Path) -> Trajectory:
         raise InputError(f"expected twelve finite numbers per line: {path}")
     T_world_base = np.tile(np.eye(4), (len(values), 1, 1))
     T_world_base[:, :3] = values.reshape(-1, 3, 4)
+    wrong = np.flatnonzero(~_are_rotations(T_world_base[:, :3, :3]))
+    if len(wrong):
+        raise InputError(f"pose {wrong[0] + 1}: its first three columns are no rotation: {path}")
     stamps_ns = np.arange(len(values), dtype=np.int64) * 10**9
     return Trajectory(stamps_ns=stamps_ns, T_world_base=T_world_base)
+
+
+def _are_rotations(matrices: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Tell of each matrix (N, 3, 3) whether it is orthonormal and right-handed."""
+    products = matrices @ matrices.transpose(0, 2, 1)
+    is_orthonormal = (np.abs(products - np.eye(3)) <= _ROTATION_TOLERANCE).all(axis=(1, 2))
+    return np.asarray(is_orthonormal & (np.linalg.det(matrices) > 0))

@@ -33,7 +33,7 @@ class Relations:
         if not path.is_file():
             raise InputError(f"relations file not found: {path}")
         lines = path.read_text(errors="replace").splitlines()
-        rows = [_row(line, path) for line in lines if line.strip() and line[0] != "#"]
+        rows = [_row(line, path) for line in lines if line.strip() and line.lstrip()[0] != "#"]
         if not rows:
             raise InputError(f"relations file holds no relations: {path}")
         values = np.array(rows)
