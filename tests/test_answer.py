@@ -27,8 +27,8 @@ def test_a_good_run_is_told_in_one_sentence():
         ({"bridged_why": {"while dark was lost": 50}, "correct_rate": 0.7}, "[dark,OTHER]"),
         ({"bridged_why": {"while dark was rejected": 50}}, "policy.gate=null"),
         ({"bridged_why": {"after a module failed": 50}}, "run.isolation=process"),
-        ({"shortfalls": ["only 40 % of it; without: 120 without depth"]}, "no depth at these"),
-        ({"shortfalls": ["only 40 %; without: 120 before a module tracked"]}, "came late"),
+        ({"missing_why": {"without depth": 120}}, "no depth at these"),
+        ({"missing_why": {"before a module tracked": 120}}, "came late"),
         ({"false_switches": 3}, "detector.threshold"),
     ],
 )

@@ -53,6 +53,7 @@ KEYS = {
     "modules",
     "peak_rss_mb",
     "bridged",
+    "missing_why",
     "observations",
     "duration_s",
     "path_length_m",

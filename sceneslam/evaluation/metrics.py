@@ -22,7 +22,7 @@ from sceneslam.evaluation.association import clip
 from sceneslam.evaluation.comparison import compare
 from sceneslam.evaluation.correctness import correct_rate_observed
 from sceneslam.evaluation.detection import score_detection
-from sceneslam.evaluation.gaps import why_bridged
+from sceneslam.evaluation.gaps import why_bridged, why_without_pose
 from sceneslam.evaluation.path import length_ratio, segment_errors
 from sceneslam.evaluation.settings import EvaluationSettings
 from sceneslam.evaluation.shortfalls import shortfalls
@@ -51,8 +51,9 @@ def evaluate(
     """
     switches = list_switches(result, truth, settings.scenes)
     detected = {str(e["scene"]) for e in result.events if e["event"] == "scene"}
+    accuracy = _accuracy(result, truth, settings)
     metrics: Metrics = {
-        **_accuracy(result, truth, settings),
+        **accuracy,
         "coverage": coverage(result),
         "switches": switches,
         "false_switches": count_false(switches, truth, detected, settings.scenes),
@@ -62,9 +63,10 @@ def evaluate(
         "modules": _per_module(result),
         "bridged": sum(module == "" for module in result.modules),
         "bridged_why": why_bridged(result),
+        "missing_why": why_without_pose(result),
         "peak_rss_mb": peak_rss_mb,
         "faults": [str(e["what"]) for e in result.events if e["event"] == "fault"],
-        "notes": _notes(result, truth, settings),
+        "notes": _notes(result, truth, accuracy),
         "warnings": [str(e["what"]) for e in result.events if e["event"] == "warning"],
         "shortfalls": shortfalls(result, settings.coverage_min_ratio),
     }
@@ -197,16 +199,16 @@ def _percentiles(values: NDArray[np.float64], **percents: float) -> Metrics:
     }
 
 
-def _notes(result: RunResult, truth: GroundTruth | None, settings: EvaluationSettings) -> list[str]:
+def _notes(result: RunResult, truth: GroundTruth | None, accuracy: Metrics) -> list[str]:
     estimate = result.trajectory
     if truth is None or not len(truth.trajectory) or not len(estimate):
         return []
-    if len(absolute_errors(estimate, truth.trajectory, settings.association_gap_s).errors_m):
+    if accuracy["truth_matched"]:
         return []
     return [
         "no pose could be held against the ground truth: "
         f"trajectory {_span(estimate)}, ground truth {_span(truth.trajectory)}, "
-        f"association_gap_s {settings.association_gap_s:g}"
+        f"association_gap_s {accuracy['association_gap_s']:g}"
     ]
 
 

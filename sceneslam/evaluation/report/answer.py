@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -89,9 +90,6 @@ def _advice(metrics: Metrics) -> Iterator[str]:
 
 
 def _reasons(metrics: Metrics) -> Mapping[str, int]:
-    """Return the reasons for bridged or missing poses, with the number of poses."""
-    reasons: dict[str, int] = dict(metrics["bridged_why"])
-    for sentence in metrics["shortfalls"]:
-        for count, reason in re.findall(r"(\d+) ([^,;]+)", sentence.partition("without: ")[2]):
-            reasons[reason] = reasons.get(reason, 0) + int(count)
-    return reasons
+    """Return the reasons for bridged or missing poses, with the number of poses, most first."""
+    reasons = Counter(metrics["bridged_why"]) + Counter(metrics["missing_why"])
+    return dict(reasons.most_common())
