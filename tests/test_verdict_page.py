@@ -29,8 +29,9 @@ def page(tmp_path):
         trial = Trial(name=name, overrides=(f"lights={name}",), values={"seed": 3})
         folder = tmp_path / "runs" / name
         folder.mkdir(parents=True)
-        metrics = {"coverage": 1.0, "ate_rmse_m": 0.0123}
-        runs.append(Ran(trial=trial, folder=folder, metrics=metrics, faults=("torn",)))
+        metrics = {"coverage": 1.0, "ate_rmse_m": 0.0123, "shortfalls": ["<laser> failed once"]}
+        faults = ("torn",) if name == "dark" else ()
+        runs.append(Ran(trial=trial, folder=folder, metrics=metrics, faults=faults))
     (runs[0].folder / "report.html").touch()
     captions = {"seen.png": "What was seen.", "never_drawn.png": "Nothing."}
     verdict = Verdict(figures=FIGURES, table=TABLE, pictures=captions)
@@ -50,6 +51,10 @@ def test_the_page_needs_no_other_file_but_the_reports_that_it_leads_to(page):
     assert re.findall(r'src="([^"]{22})', page) == ["data:image/png;base64,"]
     assert re.findall(r'href="([^#"][^"]*)"', page) == ["runs/lit%20%231/report.html"]
     assert "Nothing." not in page and "What was seen." in page
+
+
+def test_the_page_says_what_a_trial_lacks(page):
+    assert "<td>&lt;laser&gt; failed once</td>" in page and "<td>2, first: torn</td>" in page
 
 
 def test_the_page_tells_what_was_asked_and_how_to_ask_again(page):

@@ -91,7 +91,7 @@ def _runs(folder: Path, runs: Sequence[Ran]) -> str:
             _link(folder, run),
             percent(run.metrics.get("coverage")),
             number(run.metrics.get("ate_rmse_m"), 4, " m"),
-            str(len(run.faults) or ""),
+            _amiss(run),
             " ".join([*run.trial.overrides, *(f"{k}={v}" for k, v in run.trial.values.items())]),
         ]
         for run in runs
@@ -99,6 +99,14 @@ def _runs(folder: Path, runs: Sequence[Ran]) -> str:
     is_open = " open" if len(runs) <= _OPEN_RUNS else ""
     summary = f"<summary>{len(runs)} runs</summary>"
     return f"<details{is_open}>{summary}{markup.table(heads, rows)}</details>"
+
+
+def _amiss(run: Ran) -> str:
+    """Return the number of a trial's faults and shortfalls, and the first of them."""
+    sentences = list(dict.fromkeys([*run.faults, *run.metrics.get("shortfalls", ())]))
+    if len(sentences) < 2:
+        return "".join(sentences)
+    return f"{len(sentences)}, first: {sentences[0]}"
 
 
 def _link(folder: Path, run: Ran) -> str:
