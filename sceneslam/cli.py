@@ -43,6 +43,7 @@ from sceneslam.experiment import run_experiment
 from sceneslam.storage.folder import give_back
 from sceneslam.streams import lost_output
 from sceneslam.types.errors import ConfigError, SceneSlamError, text_of
+from sceneslam.types.experiment import Verdict
 from sceneslam.types.trajectory import Trajectory
 
 OK, INCOMPLETE, UNUSABLE = 0, 1, 2
@@ -171,7 +172,7 @@ def carry_out(config: DictConfig) -> Ended:
         if config.get("experiment"):
             verdict = run_experiment(config, folder)
             print("\n".join([*verdict_lines(verdict), f"report  {_short(folder)}/report.html"]))
-            return Ended(code=OK)
+            return _ended(verdict)
         if OmegaConf.select(config, "run.mode") == DETECT_ONLY:
             faults = detect(resolved(config), folder, print)
             for fault in faults:
@@ -199,6 +200,17 @@ def carry_out(config: DictConfig) -> Ended:
     if finished.is_interrupted:
         raise KeyboardInterrupt
     return Ended(code=_code(finished, errors), errors=errors)
+
+
+def _ended(verdict: Verdict) -> Ended:
+    """Return the result of an experiment; print which bounds do not hold."""
+    failing = [figure.name for figure in verdict.figures if not figure.holds]
+    if not failing:
+        return Ended(code=OK)
+    bounds = f"{len(failing)} of {len(verdict.figures)} bounds do not hold"
+    error = f"{bounds}, first: {failing[0]}" if len(failing) > 1 else f"{bounds}: {failing[0]}"
+    print(f"error: {error}", file=sys.stderr)
+    return Ended(code=INCOMPLETE, errors=(error,))
 
 
 def _code(finished: Finished, errors: Sequence[str]) -> int:

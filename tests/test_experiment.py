@@ -191,6 +191,22 @@ def test_runs_beside_each_other_give_what_runs_in_turn_give_and_go_on_where_they
     assert {path: path.stat().st_mtime_ns for path in others} == was
 
 
+@pytest.mark.parametrize(("bound_m", "code"), [(0.1, cli.OK), (0.01, cli.INCOMPLETE)])
+def test_an_experiment_whose_bound_does_not_hold_ends_with_code_one(
+    tmp_path, monkeypatch, capsys, bound_m, code
+):
+    runtime, task = SimpleNamespace(output_dir=str(tmp_path)), SimpleNamespace(task=[])
+    given = SimpleNamespace(runtime=runtime, overrides=task)
+    figures = [Figure.at_most("far", 0.05, bound_m, "m"), Figure.at_most("near", 0.0, 1.0, "m")]
+    verdict = Verdict(figures=figures, table=Table(columns=(), rows=[]))
+    monkeypatch.setattr(cli.HydraConfig, "get", lambda: given)
+    monkeypatch.setattr(cli, "run_experiment", lambda *_: verdict)
+    ended = cli.carry_out(OmegaConf.create({"experiment": "matrix", "allow_targets": []}))
+    errors = ("1 of 2 bounds do not hold: far",) if code else ()
+    assert ended == cli.Ended(code=code, errors=errors)
+    assert capsys.readouterr().err == "".join(f"error: {one}\n" for one in errors)
+
+
 def test_a_disk_that_fails_in_an_experiment_is_one_sentence(tmp_path, monkeypatch, capsys):
     def fail(*_):
         raise OSError(5, "input/output error", "verdict.json")
