@@ -105,7 +105,7 @@ def label(runs: Sequence[ModuleRun], change_m: float) -> Labels:
         group = list(found)
         stamps_ns = _instants_ns(group)
         drift_mps = _drifts_mps(group, keys, stamps_ns)
-        is_known = ~np.isnan(drift_mps).any(axis=1)
+        is_known = np.asarray(~np.isnan(drift_mps).any(axis=1))
         if not is_known.any():
             raise InputError(f"runs: the ground truth covers none of it: {group[0].folder}")
         best = cheapest(np.where(is_known[:, None], drift_mps * STEP_S, 0.0), change_m)

@@ -52,8 +52,10 @@ def draw_paths(path: Path, paths: Mapping[str, Trajectory], truth: Trajectory | 
 
 def _true_m(first: Trajectory, truth: Trajectory | None) -> NDArray[np.float64]:
     """Return the true positions (N, 2) [m] in the frame of a trajectory."""
-    known = covered(truth, first.stamps_ns, TRUTH_GAP_S)[:1] if truth is not None else []
-    if truth is None or not len(known):
+    if truth is None:
+        return np.zeros((0, 2))
+    known = covered(truth, first.stamps_ns, TRUTH_GAP_S)[:1]
+    if not len(known):
         return np.zeros((0, 2))
     T_gt_known = interpolated(truth, first.stamps_ns[known]).T_world_base[0]
     T_map_gt = first.T_world_base[known[0]] @ se3.inverse(T_gt_known)

@@ -91,5 +91,5 @@ def _advice(metrics: Metrics) -> Iterator[str]:
 
 def _reasons(metrics: Metrics) -> Mapping[str, int]:
     """Return the reasons for bridged or missing poses, with the number of poses, most first."""
-    reasons = Counter(metrics["bridged_why"]) + Counter(metrics["missing_why"])
+    reasons: Counter[str] = Counter(metrics["bridged_why"]) + Counter(metrics["missing_why"])
     return dict(reasons.most_common())
