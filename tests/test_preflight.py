@@ -9,6 +9,7 @@ from configured import config
 from ros_recordings import STAMP_NS, Recorder
 
 from sceneslam.app import run
+from sceneslam.sources.bag.observation import Mounts
 from sceneslam.sources.bag.open_recording import open_recording
 from sceneslam.sources.carmen import Carmen
 from sceneslam.sources.kitti import Kitti
@@ -157,6 +158,7 @@ def test_sensors_without_a_common_time_are_noticed():
     assert "have no time in common" in preflight(Survey(streams=streams), rig).warnings[0]
 
 
+MOUNTS = Mounts(T_base_imu=np.eye(4), T_child_base=np.eye(4))
 STREAMS = {Sensor.IMAGE: "/image", Sensor.DEPTH: "/depth", Sensor.SCAN: "/scan"}
 CAMERA_RIG = Rig(
     sensors=frozenset({Sensor.IMAGE, Sensor.DEPTH}),
@@ -178,7 +180,9 @@ def sampled(path, times_s, *, is_slow, tolerance_s=0.02):
     recording = open_recording(path)
     recording.is_slow = is_slow  # as a bag that bzip2 packed
     topics = {sensor: topic for sensor, topic in STREAMS.items() if topic in times_s}
-    return survey_recording(recording, topics, depth_scale=1000.0, sync_tolerance_s=tolerance_s)
+    return survey_recording(
+        recording, topics, depth_scale=1000.0, sync_tolerance_s=tolerance_s, mounts=MOUNTS
+    )
 
 
 def every(period_s, since_s, until_s):

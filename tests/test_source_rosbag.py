@@ -9,6 +9,7 @@ from ros_recordings import STAMP_NS, Recorder, make_source
 from rosbags.typesys import Stores, get_typestore
 
 from sceneslam.ros.encode import Encoder
+from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.rig import Sensor, optical_to_rep103
 
@@ -231,6 +232,34 @@ def test_mounts_come_from_the_transform_tree(tmp_path: Path) -> None:
     assert other.rig.laser.T_base_laser[0, 3] == 0.25
     with pytest.raises(ConfigError, match="base_link, laser, mast"):
         make_source("mcap", tmp_path / "a.mcap", base_frame="robot")
+
+
+def odometry(recorder: Recorder, stamp_ns: int, T_odom_child: np.ndarray, child: str) -> Any:
+    """Return an Odometry of the frame `child`."""
+    data = Encoder().odometry(stamp_ns, T_odom_child, "odom")
+    message = get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr(data, "nav_msgs/msg/Odometry")
+    message.child_frame_id = child
+    return message
+
+
+@pytest.mark.parametrize(("child", "moved_m"), [("t265", 0.0), ("base_link", -1.0), ("", -1.0)])
+def test_odometry_of_another_frame_is_brought_to_the_base(
+    tmp_path: Path, child: str, moved_m: float
+) -> None:
+    """A camera 0.5 m ahead goes round the robot, which turns on the spot."""
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        tree = [transform(recorder, "base_link", "t265", 0.5)]
+        recorder.add("/tf_static", 0, recorder.new("tf2_msgs/msg/TFMessage", transforms=tree))
+        for number, T_odom_child in enumerate(
+            (se3.from_xy_yaw(0.5, 0.0, 0.0), se3.from_xy_yaw(-0.5, 0.0, np.pi))
+        ):
+            stamp_ns = STAMP_NS + number * 10**8
+            recorder.add("/odom", stamp_ns, odometry(recorder, stamp_ns, T_odom_child, child))
+    source = make_source("mcap", tmp_path / "a.mcap")
+    poses = [one.T_odom_base for one in source]
+    np.testing.assert_allclose((poses[1] - poses[0])[:2, 3], [moved_m, 0.0], atol=1e-12)
+    np.testing.assert_allclose(poses[1][:2, :2], -np.eye(2), atol=1e-12)
+    np.testing.assert_allclose(source.survey().T_odom_base[-1], poses[1])
 
 
 def test_without_transforms_the_camera_looks_ahead(tmp_path: Path) -> None:

@@ -62,6 +62,11 @@ def frame_id(message: Any) -> str:
     return str(message.header.frame_id).lstrip("/")
 
 
+def child_frame_id(message: Any) -> str:
+    """Return the frame whose pose a message reports, "" if its type or publisher names none."""
+    return str(getattr(message, "child_frame_id", "")).lstrip("/")
+
+
 def is_depth(message: Any, topic: str) -> bool:
     """Tell whether an Image or CompressedImage holds depth rather than colour."""
     encoding, is_compressed = _encoding(message)

@@ -6,15 +6,19 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any
 
-import numpy as np
-
 from sceneslam.ros import decode
 from sceneslam.ros.pixels import DepthUnits
 from sceneslam.sources.bag.frames import FrameTree
 from sceneslam.sources.bag.observation import PRIMARY, BundleDecoder, Decoded, measured
 from sceneslam.sources.bag.open_recording import open_recording
 from sceneslam.sources.bag.recording import Message
-from sceneslam.sources.bag.rig import Given, make_rig, picture_size_wh, place, sensor_topics
+from sceneslam.sources.bag.rig import (
+    Given,
+    find_mounts,
+    make_rig,
+    picture_size_wh,
+    sensor_topics,
+)
 from sceneslam.sources.bag.synchronise import Sample, SynchronisedSamples, Synchroniser
 from sceneslam.sources.bag.topics import choose_topics, describe
 from sceneslam.sources.bag.truth import BASE, CAMERA, read_truth
@@ -72,6 +76,7 @@ class RosBag:
             self._primary = self._choose_primary()
             self._frames = FrameTree(self._recording, base_frame)
             self._rig = make_rig(self._recording, self._topics, self._frames, given)
+            self._mounts = find_mounts(self._recording, self._topics, self._frames)
         except InputError as err:
             raise InputError(f"{err}: {path}") from err
 
@@ -121,6 +126,7 @@ class RosBag:
             {sensor: self._by_sensor[sensor] for sensor in Sensor if sensor in self._by_sensor},
             depth_scale=self._depth_scale,
             sync_tolerance_s=self._sync_tolerance_s,
+            mounts=self._mounts,
         )
 
     def ground_truth(self) -> GroundTruth | None:
@@ -142,15 +148,12 @@ class RosBag:
         synchroniser = Synchroniser(
             self._primary, frozenset(self._by_sensor), self._sync_tolerance_s
         )
-        T_base_imu = np.eye(4)
-        if self._topics.imu:
-            T_base_imu = place(self._recording, self._topics.imu, self._frames)
         for message in self._recording.messages(topics):
-            for sensor, sample in self._samples(message, T_base_imu):
+            for sensor, sample in self._samples(message):
                 yield from synchroniser.add(sensor, sample)
         yield from synchroniser.flush()
 
-    def _samples(self, message: Message, T_base_imu: Any) -> Iterator[tuple[Sensor, Sample]]:
+    def _samples(self, message: Message) -> Iterator[tuple[Sensor, Sample]]:
         """Yield a message's samples; for an invalid message, none, and count a fault."""
         value = self._recording.decode(message)
         if value is None:
@@ -160,7 +163,7 @@ class RosBag:
             return
         stamp_ns = decode.stamp_ns(value) or message.log_ns
         for sensor in (one for one, topic in self._by_sensor.items() if topic == message.topic):
-            held = measured(value, sensor, T_base_imu)
+            held = measured(value, sensor, self._mounts)
             if held is not None:
                 yield sensor, Sample(stamp_ns=stamp_ns, value=held)
             elif sensor is Sensor.ODOMETRY:

@@ -164,15 +164,24 @@ def _samples(bundle: SynchronisedSamples, sensor: Sensor) -> NDArray[np.float64]
     return locked(np.array(rows, dtype=np.float64))
 
 
-def measured(message: Any, sensor: Sensor, T_base_imu: Transform) -> Any:
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Mounts:
+    """The poses on the robot by which measurements are brought into `base`."""
+
+    T_base_imu: Transform  # (4, 4) [m]
+    T_child_base: Transform  # (4, 4) [m]; child: the frame whose pose odometry reports
+
+
+def measured(message: Any, sensor: Sensor, mounts: Mounts) -> Any:
     """Return a sensor's measurement in a decoded message, None if it is invalid.
 
     Odometry gives T_odom_base (4, 4) [m], an Imu the vector (3,) [rad/s or m/s^2] in base, any
     other type the message itself.
     """
     if sensor is Sensor.ODOMETRY:
-        return decode.transform(message.pose.pose.position, message.pose.pose.orientation)
+        T_odom_child = decode.transform(message.pose.pose.position, message.pose.pose.orientation)
+        return None if T_odom_child is None else T_odom_child @ mounts.T_child_base
     if sensor.is_sampled:
         held = decode.inertial(message).get(sensor)
-        return None if held is None else T_base_imu[:3, :3] @ held
+        return None if held is None else mounts.T_base_imu[:3, :3] @ held
     return message

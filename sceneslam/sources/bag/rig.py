@@ -8,6 +8,7 @@ from typing import Any
 
 from sceneslam.ros import decode, names, pixels
 from sceneslam.sources.bag.frames import FrameTree
+from sceneslam.sources.bag.observation import Mounts
 from sceneslam.sources.bag.recording import Recording
 from sceneslam.sources.bag.topics import BagTopics, first
 from sceneslam.sources.intrinsics import Intrinsics
@@ -74,6 +75,16 @@ def place(recording: Recording, topic: str, frames: FrameTree) -> Transform:
     message = first(recording, topic)
     T_base_sensor = None if message is None else frames.T_base(decode.frame_id(message))
     return se3.identity() if T_base_sensor is None else T_base_sensor
+
+
+def find_mounts(recording: Recording, topics: BagTopics, frames: FrameTree) -> Mounts:
+    """Return the poses of the IMU and of odometry's frame; identity where they are not recorded."""
+    T_base_imu = place(recording, topics.imu, frames) if topics.imu else se3.identity()
+    message = first(recording, topics.odometry) if topics.odometry else None
+    child = "" if message is None else decode.child_frame_id(message)
+    T_base_child = frames.T_base(child) if child else None
+    T_child_base = se3.identity() if T_base_child is None else se3.inverse(T_base_child)
+    return Mounts(T_base_imu=T_base_imu, T_child_base=T_child_base)
 
 
 def picture_size_wh(recording: Recording, topics: BagTopics) -> tuple[int, int]:

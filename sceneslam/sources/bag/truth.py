@@ -43,7 +43,8 @@ def _tracked(
     recording: Recording, topic: str, frames: FrameTree, rig: Rig, truth_frame: str | None
 ) -> Transform:
     """Return T_base_tracked (4, 4) [m], where `tracked` is the frame of the recorded poses."""
-    child = str(getattr(first(recording, topic), "child_frame_id", "")).lstrip("/")
+    message = first(recording, topic)
+    child = "" if message is None else decode.child_frame_id(message)
     T_base_child = frames.T_base(child) if child else None
     if truth_frame is None and T_base_child is not None:
         return T_base_child

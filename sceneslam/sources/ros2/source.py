@@ -12,7 +12,13 @@ from sceneslam.ros.pixels import DepthUnits
 from sceneslam.ros.transport.transport import Arrival, Network, Transport, open_transport
 from sceneslam.sources.bag.frames import FrameTree
 from sceneslam.sources.bag.observation import PRIMARY, BundleDecoder, measured
-from sceneslam.sources.bag.rig import Given, make_rig, picture_size_wh, place, sensor_topics
+from sceneslam.sources.bag.rig import (
+    Given,
+    find_mounts,
+    make_rig,
+    picture_size_wh,
+    sensor_topics,
+)
 from sceneslam.sources.bag.synchronise import Sample, SynchronisedSamples, Synchroniser
 from sceneslam.sources.bag.topics import NONE, TYPES, choose_topics
 from sceneslam.sources.faults import FaultLog, at_stamp
@@ -120,6 +126,7 @@ class Ros2(Measuring):
             {sensor: self._by_sensor[sensor] for sensor in Sensor if sensor in self._by_sensor},
             depth_scale=self._depth_scale,
             sync_tolerance_s=self._sync_tolerance_s,
+            mounts=self._mounts,
             unplaced=self._unplaced(),
             silent=sorted(self.heard.announced.keys() - self.heard.topics.keys()),
             odd=list(oddities(self.heard, [name for name in self._named.values() if name])),
@@ -179,6 +186,7 @@ class Ros2(Measuring):
                 raise InputError("no image, depth, points, scan or odometry")
             self.frames = FrameTree(heard, self._base_frame)
             self._rig = make_rig(heard, self.topics, self.frames, self._given)
+            self._mounts = find_mounts(heard, self.topics, self.frames)
         except InputError as error:
             raise InputError(f"{error}: {self._where()}, {self._there()}") from error
 
@@ -193,7 +201,6 @@ class Ros2(Measuring):
         self._decoder = MessageDecoder(
             {topic: TopicType.of_network(types[topic]) for topic in used}
         )
-        self._T_base_imu = place(self.heard, self.topics.imu or "", self.frames)
         camera, is_seeing = self._rig.camera, bool(self.topics.image or self.topics.depth)
         units = DepthUnits(self._depth_scale, camera.depth_range_m if camera else (0.0, 100.0))
         size_wh = picture_size_wh(self.heard, self.topics) if is_seeing else None
@@ -263,7 +270,7 @@ class Ros2(Measuring):
         if lined.order is StampOrder.UNORDERED:
             return
         for sensor in (one for one, name in self._by_sensor.items() if name == topic):
-            held = measured(message, sensor, self._T_base_imu)
+            held = measured(message, sensor, self._mounts)
             if held is not None:
                 yield sensor, Sample(stamp_ns=lined.stamp_ns, value=held)
 

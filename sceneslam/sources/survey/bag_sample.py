@@ -11,6 +11,7 @@ import numpy as np
 from sceneslam.ros import decode
 from sceneslam.ros.clouds import cloud
 from sceneslam.ros.pixels import DepthUnits
+from sceneslam.sources.bag.observation import Mounts, measured
 from sceneslam.sources.bag.recording import Message, Recording
 from sceneslam.sources.survey.survey import Stamps, Stream, Survey
 from sceneslam.types.rig import Sensor
@@ -27,6 +28,7 @@ def survey_recording(
     *,
     depth_scale: float,
     sync_tolerance_s: float,
+    mounts: Mounts,
     unplaced: Sequence[str] = (),
     silent: Sequence[str] = (),
     odd: Sequence[str] = (),
@@ -40,7 +42,7 @@ def survey_recording(
     lasts = [one for topic in used if (one := recording.last(topic)) is not None]
     start_ns = min((one.log_ns for one in firsts), default=0)
     end_ns = max((one.log_ns for one in lasts), default=0)
-    samples = _Samples(topics, DepthUnits.unlimited(depth_scale))
+    samples = _Samples(topics, DepthUnits.unlimited(depth_scale), mounts)
     for stretch in (firsts, *_stretches(recording, used, start_ns, end_ns), lasts):
         samples.begin()
         for message in stretch:
@@ -105,8 +107,8 @@ def _stretch(
 class _Samples:
     """The contents of the sampled messages."""
 
-    def __init__(self, sensors: Collection[Sensor], units: DepthUnits) -> None:
-        self._units = units
+    def __init__(self, sensors: Collection[Sensor], units: DepthUnits, mounts: Mounts) -> None:
+        self._units, self._mounts = units, mounts
         self._stamps_ns: dict[Sensor, list[list[int]]] = {sensor: [] for sensor in sensors}
         self._counts: dict[Sensor, int] = {}
         self.is_scaled = False  # depth is stored as integers
@@ -127,7 +129,7 @@ class _Samples:
         """Add a message's stamp, and its contents if it is one of the first of its time span."""
         self._stamps_ns[sensor][-1].append(stamp_ns)
         if sensor is Sensor.ODOMETRY:
-            T_odom_base = decode.transform(value.pose.pose.position, value.pose.pose.orientation)
+            T_odom_base = measured(value, sensor, self._mounts)
             if T_odom_base is not None:
                 self.odometry_ns.append(stamp_ns)
                 self.T_odom_base.append(T_odom_base)
