@@ -4,6 +4,7 @@ import signal
 import socket
 import sys
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -180,6 +181,25 @@ def test_legend_has_a_line_of_its_colour_for_every_name():
     rows = [picture[16 + 32 * row, 20].tolist() for row in range(2)]
     assert rows == [[0, 114, 178], [213, 94, 0]]
     assert picture[:, 52:].any()  # the names
+
+
+def stood_in_for(monkeypatch):
+    """Return a sink and the recording that stands in for Rerun's, which need not be installed."""
+    monkeypatch.setitem(sys.modules, "rerun", MagicMock())
+    sink = sink_to("run.rrd")
+    sink._recording = MagicMock()
+    return sink, sink._recording
+
+
+def test_events_from_before_the_first_observation_do_not_move_the_time_line(monkeypatch):
+    sink, recording = stood_in_for(monkeypatch)
+    warning = {"event": "warning", "stamp_ns": 0, "what": "a lens"}
+    sink.write_event(warning)
+    for stamp_ns in (10**18, 10**18 + 10**9):
+        sink.write(Observation(stamp_ns=stamp_ns), None, "")
+    sink.write_event(warning)
+    times_s = [call.kwargs["duration"] for call in recording.set_time.call_args_list]
+    assert times_s == [0.0, 0.0, 1.0, 0.0]
 
 
 def test_tracker_states_do_not_crowd_the_decisions(tmp_path):

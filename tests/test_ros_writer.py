@@ -1,5 +1,6 @@
 """What is recorded is read back: observations, rig and truth."""
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -203,6 +204,25 @@ def test_the_sinks_poses_are_results_and_no_input(tmp_path: Path) -> None:
     read = list(source)
     np.testing.assert_allclose(read[1].T_odom_base, made[1].T_odom_base, atol=1e-14)
     assert len(source.ground_truth().trajectory) == 3
+
+
+def test_a_warning_without_a_stamp_does_not_begin_the_recording(tmp_path: Path) -> None:
+    sink = McapSink("run.mcap", "jpeg", 90, 1, 1)
+    sink.open(RIG, tmp_path)
+    warning = {"event": "warning", "stamp_ns": 0, "what": "a lens"}
+    sink.write_event(warning)
+    made = observations(2)
+    for observation in made:
+        sink.write(replace(observation, gyro_base=None, accelerometer_base=None), None, "")
+    sink.write_event(warning)
+    sink.close()
+    recording = open_recording(tmp_path / "run.mcap")
+    times_ns = [one.log_ns for one in recording.messages({names.RESULT_EVENTS})]
+    assert times_ns == [made[0].stamp_ns] * 2
+    sink.open(RIG, tmp_path)  # a run without an observation
+    sink.write_event(warning)
+    sink.close()
+    assert len(list(open_recording(tmp_path / "run.mcap").messages({names.RESULT_EVENTS}))) == 1
 
 
 def test_recordings_open_with_the_reference_reader(tmp_path: Path) -> None:

@@ -42,6 +42,8 @@ class McapSink:
         self._images = self._depths = 0
         self._writer: ObservationWriter | None = None
         self._module = ""
+        self._start_ns: int | None = None
+        self._early: list[Event] = []  # before the first observation
 
     def open(self, rig: Rig, folder: Path) -> None:
         """Open the file, which gets its final name in `close`; a relative path is in `folder`."""
@@ -53,6 +55,7 @@ class McapSink:
         )
         self._images = self._depths = 0
         self._module = ""
+        self._start_ns, self._early = None, []
 
     def write(self, observation: Observation, T_map_base: Transform | None, module: str) -> None:
         """Add an observation, its pose if there is one, and the module if it changed."""
@@ -64,12 +67,17 @@ class McapSink:
         if module != self._module:
             self._writer.write_module(observation.stamp_ns, module)
             self._module = module
+        if self._start_ns is None:
+            self._start_ns = observation.stamp_ns
+            self._write_early()
 
     def write_event(self, event: Event) -> None:
-        """Add one event as JSON text."""
-        if self._writer is not None:
+        """Add one event as JSON text; one from before the first observation, at its stamp."""
+        if self._start_ns is None:
+            self._early.append(event)
+        elif self._writer is not None:
             text = json.dumps(dict(event), default=str)
-            self._writer.write_event(int(event["stamp_ns"]), text)
+            self._writer.write_event(max(int(event["stamp_ns"]), self._start_ns), text)
 
     def write_truth(self, truth: GroundTruth) -> None:
         """Add the ground truth, for the evaluation of later runs."""
@@ -84,10 +92,17 @@ class McapSink:
     def close(self) -> None:
         """Close the file, and log its size."""
         if self._writer is not None:
+            self._write_early()
             writer, self._writer = self._writer, None
             writer.close()
             finish(self._file)
             _log.info("%s: %.1f MB", self._file.name, self._file.stat().st_size / 1e6)
+
+    def _write_early(self) -> None:
+        early, self._early = self._early, []
+        self._start_ns = self._start_ns or 0
+        for event in early:
+            self.write_event(event)
 
     def _thinned(self, observation: Observation) -> Observation:
         """Return the observation without the images that are not due."""

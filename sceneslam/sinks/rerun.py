@@ -97,6 +97,8 @@ class RerunSink:
         recording = self._recording
         if recording is None:
             return
+        if self._start_ns is None:
+            self._start_ns = observation.stamp_ns
         self._set_time(recording, observation.stamp_ns)
         if T_map_base is not None:
             self._first = self._first or (observation.stamp_ns, T_map_base)
@@ -143,9 +145,9 @@ class RerunSink:
                 finish(self._file)
 
     def _set_time(self, recording: rr.RecordingStream, stamp_ns: int) -> None:
-        if self._start_ns is None:
-            self._start_ns = stamp_ns
-        recording.set_time(at.TIMELINE, duration=(stamp_ns - self._start_ns) * 1e-9)
+        """Set the time since the first observation; zero for an event before it."""
+        since_ns = 0 if self._start_ns is None else max(stamp_ns - self._start_ns, 0)
+        recording.set_time(at.TIMELINE, duration=since_ns * 1e-9)
 
     def _write_pose(self, recording: rr.RecordingStream, T_map_base: Transform, key: str) -> None:
         quaternion = self._rr.Quaternion(xyzw=se3.to_quat_xyzw(T_map_base))
