@@ -262,6 +262,29 @@ def test_odometry_of_another_frame_is_brought_to_the_base(
     np.testing.assert_allclose(source.survey().T_odom_base[-1], poses[1])
 
 
+def test_gyro_and_accelerometer_may_come_in_messages_of_their_own(tmp_path: Path) -> None:
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    samples = {
+        Sensor.GYRO: np.array([0.1, 0.2, 0.3]),
+        Sensor.ACCELEROMETER: np.array([0.0, 0.0, 9.81]),
+    }
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        for number in range(20):
+            stamp_ns = STAMP_NS + number * 10**7
+            for later_ns, (sensor, vector) in enumerate(samples.items()):
+                data = Encoder().imu(stamp_ns + later_ns, {sensor: vector})
+                message = store.deserialize_cdr(data, "sensor_msgs/msg/Imu")
+                recorder.add("/imu", stamp_ns + later_ns, message)
+            recorder.scan("/scan", stamp_ns + 5, [1.0] * 21)
+    source = make_source("mcap", tmp_path / "a.mcap")
+    assert source.rig.sensors == {Sensor.SCAN, *samples}
+    assert sum(len(one.gyro_base) for one in source) == 20
+    assert sum(len(one.accelerometer_base) for one in source) == 20
+    survey = source.survey()
+    np.testing.assert_allclose(survey.gyro_radps[0], samples[Sensor.GYRO])
+    assert survey.stream(Sensor.GYRO).rate_hz == pytest.approx(100.0)
+
+
 def test_without_transforms_the_camera_looks_ahead(tmp_path: Path) -> None:
     source = make_source("mcap", rgbd(tmp_path / "a.mcap", size_wh=(40, 30)))
     np.testing.assert_array_equal(source.rig.camera.T_base_cam, optical_to_rep103())

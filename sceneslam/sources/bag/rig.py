@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import Any
 
 from sceneslam.ros import decode, names, pixels
@@ -26,6 +27,7 @@ _NEEDS = {  # sensor -> field of BagTopics that names its topic
     Sensor.GYRO: "imu",
     Sensor.ACCELEROMETER: "imu",
 }
+_FIRST_IMU = 100  # messages searched for both sensors, which may come in messages of their own
 _DEPTH_RANGE_M, _LIDAR_RANGE_M = (0.3, 8.0), (1.0, 100.0)
 
 
@@ -42,8 +44,13 @@ class Given:
 def sensor_topics(recording: Recording, topics: BagTopics) -> dict[Sensor, str]:
     """Return the topic of each recorded sensor; one Imu topic can be gyro and accelerometer."""
     chosen = {sensor: getattr(topics, need) for sensor, need in _NEEDS.items()}
-    imu = first(recording, topics.imu) if topics.imu else None
-    measured = {} if imu is None else decode.inertial(imu)
+    measured: set[Sensor] = set()
+    if topics.imu:
+        for message in islice(recording.messages({topics.imu}), _FIRST_IMU):
+            imu = recording.decode(message)
+            measured |= set() if imu is None else decode.inertial(imu).keys()
+            if len(measured) == 2:
+                break
     return {
         sensor: name
         for sensor, name in chosen.items()

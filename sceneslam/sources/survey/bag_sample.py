@@ -126,15 +126,16 @@ class _Samples:
             spans.append([])
 
     def take(self, sensor: Sensor, stamp_ns: int, value: Any) -> None:
-        """Add a message's stamp, and its contents if it is one of the first of its time span."""
+        """Add a valid message's stamp, and its contents if it is one of its time span's first."""
+        held = measured(value, sensor, self._mounts)
+        if held is None:
+            return
         self._stamps_ns[sensor][-1].append(stamp_ns)
         if sensor is Sensor.ODOMETRY:
-            T_odom_base = measured(value, sensor, self._mounts)
-            if T_odom_base is not None:
-                self.odometry_ns.append(stamp_ns)
-                self.T_odom_base.append(T_odom_base)
+            self.odometry_ns.append(stamp_ns)
+            self.T_odom_base.append(held)
         elif sensor is Sensor.GYRO:
-            self.gyro_radps.append(decode.inertial(value)[sensor])
+            self.gyro_radps.append(held)
         elif self._counts.get(sensor, 0) < _MOST_SAMPLES:
             self._counts[sensor] = self._counts.get(sensor, 0) + 1
             self._decode(sensor, stamp_ns, value)
