@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -158,6 +160,20 @@ def test_sensors_without_a_common_time_are_noticed():
     assert "have no time in common" in preflight(Survey(streams=streams), rig).warnings[0]
 
 
+@pytest.mark.parametrize(
+    ("delay_s", "said"),
+    [(0.4, ""), (None, ""), (-37.0, "37.0 s ahead of"), (37.1, "37.0 s behind")],
+)
+def test_a_sensor_with_another_clock_is_noticed(delay_s, said):
+    streams = [
+        replace(stream(Sensor.IMAGE), delay_s=0.05),
+        replace(stream(Sensor.SCAN), delay_s=delay_s),
+    ]
+    found = preflight(Survey(streams=streams), Rig(sensors=frozenset({Sensor.IMAGE}))).warnings
+    assert len(found) == bool(said)
+    assert said in "".join(found)
+
+
 MOUNTS = Mounts(T_base_imu=np.eye(4), T_child_base=np.eye(4))
 STREAMS = {Sensor.IMAGE: "/image", Sensor.DEPTH: "/depth", Sensor.SCAN: "/scan"}
 CAMERA_RIG = Rig(
@@ -198,6 +214,7 @@ def test_first_and_last_stamp_are_the_recordings_however_little_is_sampled(tmp_p
     assert scans.stamps_ns[[0, -1]].tolist() == [first_ns, first_ns + 19_900_000_000]
     assert scans.sampled_ns[1][0] == first_ns
     assert len(scans.stamps_ns) < scans.count == 200
+    assert scans.delay_s == 0.0
     assert all(len(span_ns) for span_ns in scans.sampled_ns)
     (line,) = preflight(survey, Rig(sensors=frozenset({Sensor.SCAN}))).lines
     assert "; sampled: 10 Hz, 100% of beams return" in line

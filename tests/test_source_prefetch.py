@@ -56,7 +56,9 @@ def bundles(
     synchroniser = Synchroniser(primary, streams, tolerance_s)
     found: list[SynchronisedSamples] = []
     for sensor, stamp_ms, value in samples:
-        found += synchroniser.add(sensor, Sample(stamp_ns=stamp_ms * MS, value=value))
+        found += synchroniser.add(
+            sensor, Sample(stamp_ns=stamp_ms * MS, arrived_ns=stamp_ms * MS, value=value)
+        )
     return [*found, *synchroniser.flush()]
 
 
@@ -113,8 +115,23 @@ def test_odometry_is_interpolated_and_not_across_a_gap() -> None:
 def test_a_stream_that_stopped_holds_nothing_up_for_long() -> None:
     streams = frozenset({Sensor.IMAGE, Sensor.ODOMETRY})
     synchroniser = Synchroniser(Sensor.IMAGE, streams, 0.02)
-    given = [
-        len(list(synchroniser.add(Sensor.IMAGE, Sample(stamp_ns=index * 100 * MS, value=""))))
-        for index in range(30)
-    ]
+    times_ns = [index * 100 * MS for index in range(30)]
+    images = [Sample(stamp_ns=at_ns, arrived_ns=at_ns, value="") for at_ns in times_ns]
+    given = [len(list(synchroniser.add(Sensor.IMAGE, image))) for image in images]
     assert sum(given) >= 18
+
+
+@pytest.mark.parametrize("ahead_s", [0, 37, -37])
+def test_clock_of_one_sensor_does_not_take_the_others_apart(ahead_s: int) -> None:
+    streams = frozenset({Sensor.IMAGE, Sensor.DEPTH, Sensor.SCAN})
+    synchroniser = Synchroniser(Sensor.IMAGE, streams, 0.02)
+    found: list[SynchronisedSamples] = []
+    for begin_ms in range(0, 10_000, 100):
+        for sensor, after_ms in ((Sensor.IMAGE, 0), (Sensor.SCAN, 3), (Sensor.DEPTH, 6)):
+            shift_ns = ahead_s * 1000 * MS if sensor is Sensor.SCAN else 0
+            stamp_ns, arrived_ns = begin_ms * MS + shift_ns, (begin_ms + after_ms) * MS
+            sample = Sample(stamp_ns=stamp_ns, arrived_ns=arrived_ns, value=begin_ms)
+            found += synchroniser.add(sensor, sample)
+    found += synchroniser.flush()
+    assert len(found) == 100
+    assert all(one.depth and one.depth.value == one.primary.value for one in found)

@@ -165,7 +165,7 @@ class RosBag:
         for sensor in (one for one, topic in self._by_sensor.items() if topic == message.topic):
             held = measured(value, sensor, self._mounts)
             if held is not None:
-                yield sensor, Sample(stamp_ns=stamp_ns, value=held)
+                yield sensor, Sample(stamp_ns=stamp_ns, arrived_ns=message.log_ns, value=held)
             elif sensor is Sensor.ODOMETRY:
                 fault = f"a pose of {message.topic} is not a rigid transform"
                 self._faults.add(fault, at_stamp(stamp_ns))

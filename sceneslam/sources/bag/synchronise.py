@@ -24,7 +24,8 @@ _MOST_HELD = 4096  # queued samples per stream
 class Sample:
     """A message's stamp and value."""
 
-    stamp_ns: int
+    stamp_ns: int  # on the sensor's clock
+    arrived_ns: int  # on the clock of the recording, or of this machine: one for all sensors
     value: Any
 
 
@@ -45,7 +46,8 @@ class SynchronisedSamples:
 class Synchroniser:
     """Takes samples in the order of recording; gives sets in the order of the primary's.
 
-    A set waits for the streams in `waits_for` (None: all) until any sample is `patience_s` newer.
+    A set waits for the streams in `waits_for` (None: all) until any sample has arrived `patience_s`
+    later. Stamps do not measure this wait: one sensor's clock can be ahead of the others'.
     """
 
     def __init__(
@@ -68,7 +70,7 @@ class Synchroniser:
             sensor: deque(maxlen=_MOST_HELD) for sensor in streams - {primary}
         }
         self._seen_ns: dict[Sensor, int] = {}  # the latest stamp of each stream
-        self._newest_ns = 0
+        self._arrived_ns = 0  # the latest arrival
         self._taken_ns: dict[Sensor, int] = {}  # the newest sample used in a set
         self._passed: Sample | None = None  # the odometry before the oldest queued one
 
@@ -76,8 +78,8 @@ class Synchroniser:
         """Add a sample; yield the sets that are complete now."""
         (self._waiting if sensor is self._primary else self._held[sensor]).append(sample)
         self._seen_ns[sensor] = max(self._seen_ns.get(sensor, 0), sample.stamp_ns)
-        self._newest_ns = max(self._newest_ns, sample.stamp_ns)
-        while self._waiting and self._is_complete(self._waiting[0].stamp_ns):
+        self._arrived_ns = max(self._arrived_ns, sample.arrived_ns)
+        while self._waiting and self._is_complete(self._waiting[0]):
             yield self._bundle(self._waiting.popleft())
 
     def follow(self, primary: Sensor, waits_for: frozenset[Sensor]) -> None:
@@ -94,9 +96,10 @@ class Synchroniser:
         while self._waiting:
             yield self._bundle(self._waiting.popleft())
 
-    def _is_complete(self, stamp_ns: int) -> bool:
-        """Tell whether no stream can still have a sample for the stamp."""
-        if self._newest_ns - stamp_ns > self._patience_ns:
+    def _is_complete(self, primary: Sample) -> bool:
+        """Tell whether no stream can still have a sample for the primary one's stamp."""
+        stamp_ns = primary.stamp_ns
+        if self._arrived_ns - primary.arrived_ns > self._patience_ns:
             return True
         for sensor, held in self._held.items():
             if sensor not in self._waits_for:

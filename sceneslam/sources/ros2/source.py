@@ -272,7 +272,10 @@ class Ros2(Measuring):
         for sensor in (one for one, name in self._by_sensor.items() if name == topic):
             held = measured(message, sensor, self._mounts)
             if held is not None:
-                yield sensor, Sample(stamp_ns=lined.stamp_ns, value=held)
+                yield (
+                    sensor,
+                    Sample(stamp_ns=lined.stamp_ns, arrived_ns=arrival.arrived_ns, value=held),
+                )
 
     def _leave_out(self, problem: str, stamp_ns: int) -> None:
         """Count a message that cannot be used, and report it."""

@@ -51,7 +51,7 @@ def survey_recording(
                 continue
             stamp_ns = decode.stamp_ns(value) or message.log_ns
             for sensor in (one for one, topic in topics.items() if topic == message.topic):
-                samples.take(sensor, stamp_ns, value)
+                samples.take(sensor, stamp_ns, value, delay_ns=message.log_ns - stamp_ns)
     streams = [
         Stream(
             sensor=sensor,
@@ -59,6 +59,7 @@ def survey_recording(
             count=recording.topics[topic].count,
             stamps_ns=np.unique(np.concatenate(samples.stamps_ns(sensor))),
             sampled_ns=samples.stamps_ns(sensor),
+            delay_s=samples.delay_s(sensor),
         )
         for sensor, topic in topics.items()
     ]
@@ -110,6 +111,7 @@ class _Samples:
     def __init__(self, sensors: Collection[Sensor], units: DepthUnits, mounts: Mounts) -> None:
         self._units, self._mounts = units, mounts
         self._stamps_ns: dict[Sensor, list[list[int]]] = {sensor: [] for sensor in sensors}
+        self._delays_ns: dict[Sensor, list[int]] = {sensor: [] for sensor in sensors}
         self._counts: dict[Sensor, int] = {}
         self.is_scaled = False  # depth is stored as integers
         self.depths_m: list[Any] = []
@@ -125,12 +127,13 @@ class _Samples:
         for spans in self._stamps_ns.values():
             spans.append([])
 
-    def take(self, sensor: Sensor, stamp_ns: int, value: Any) -> None:
+    def take(self, sensor: Sensor, stamp_ns: int, value: Any, *, delay_ns: int) -> None:
         """Add a valid message's stamp, and its contents if it is one of its time span's first."""
         held = measured(value, sensor, self._mounts)
         if held is None:
             return
         self._stamps_ns[sensor][-1].append(stamp_ns)
+        self._delays_ns[sensor].append(delay_ns)
         if sensor is Sensor.ODOMETRY:
             self.odometry_ns.append(stamp_ns)
             self.T_odom_base.append(held)
@@ -143,6 +146,11 @@ class _Samples:
     def stamps_ns(self, sensor: Sensor) -> Sequence[Stamps]:
         """Return the stamps (N,), rising, of each time span."""
         return [np.array(sorted(span), np.int64) for span in self._stamps_ns[sensor]]
+
+    def delay_s(self, sensor: Sensor) -> float | None:
+        """Return the median time [s] from stamp to recording, None without a message."""
+        delays_ns = self._delays_ns[sensor]
+        return float(np.median(delays_ns)) * 1e-9 if delays_ns else None
 
     def _decode(self, sensor: Sensor, stamp_ns: int, value: Any) -> None:
         if sensor is Sensor.DEPTH:

@@ -27,6 +27,7 @@ class Stream:
     count: int  # in the whole recording
     stamps_ns: Stamps  # (N,) rising; all, or the first, the last and the sampled ones
     sampled_ns: Sequence[Stamps] = ()  # (M,) rising, of each sampled time span
+    delay_s: float | None = None  # median from stamps to recording, between two clocks; if known
 
     @property
     def is_sampled(self) -> bool:
