@@ -161,6 +161,16 @@ def test_reset_odometry_and_a_clock_that_jumped_are_the_robots_in_what_is_sent(a
     np.testing.assert_allclose(T_map_odom @ T_odom_base, T_map_base, atol=1e-9)
 
 
+def test_path_and_health_go_on_when_the_robots_clock_was_set_back(air, sink):
+    sink.write(seen(1000 * S, at(0.0)), at(0.0), "laser")
+    sink.write_event(
+        {"event": "clock_jump", "stamp_ns": 0, "topic": "/odom", "shift_ns": 100 * S, "paces": True}
+    )
+    sink.write(seen(1001 * S, at(0.0)), at(0.0), "laser")
+    assert len(air.sent["/sceneslam/path"]) == len(air.sent["/diagnostics"]) == 2
+    assert stamp_ns(air.last("/diagnostics")) == 901 * S
+
+
 def test_covariance_is_along_the_axes_of_the_map(air, sink):
     sink.write_covariance(S, np.diag([0.04, 0.01, 0, 0, 0, 0.02]))
     sink.write(seen(S, at(0.0)), at(0.0, 0.0, np.pi / 2), "laser")

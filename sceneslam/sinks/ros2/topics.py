@@ -125,8 +125,8 @@ class TopicSink:
             self._keep(stamp_ns, T_map_base)
             self._live_map.add(observation, T_map_base)
         self._say(MODULE, module)
-        if stamp_ns - self._slow_ns >= _SLOW_NS:
-            self._slow_ns = stamp_ns
+        if observation.stamp_ns - self._slow_ns >= _SLOW_NS:
+            self._slow_ns = observation.stamp_ns
             self._send_path()
             self._send_health(stamp_ns, module)
 
