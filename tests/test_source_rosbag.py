@@ -262,6 +262,28 @@ def test_odometry_of_another_frame_is_brought_to_the_base(
     np.testing.assert_allclose(source.survey().T_odom_base[-1], poses[1])
 
 
+@pytest.mark.parametrize(
+    ("connected", "unplaced"),
+    [((), ["laser", "imu"]), (("laser",), ["imu"]), (("laser", "imu"), [])],
+)
+def test_sensors_that_no_transform_places_are_named(
+    tmp_path: Path, connected: tuple[str, ...], unplaced: list[str]
+) -> None:
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        tree = [transform(recorder, "base_link", child, 0.5) for child in connected]
+        if tree:
+            recorder.add("/tf_static", 0, recorder.new("tf2_msgs/msg/TFMessage", transforms=tree))
+        recorder.scan("/scan", STAMP_NS, [1.0, 2.0])
+        data = Encoder().imu(STAMP_NS, {Sensor.GYRO: np.zeros(3)})
+        message = get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr(data, "sensor_msgs/msg/Imu")
+        message.header.frame_id = "imu"
+        recorder.add("/imu", STAMP_NS, message)
+    assert make_source("mcap", tmp_path / "a.mcap").survey().unplaced == unplaced
+    if not connected:  # a laser alone is where the robot is
+        alone = make_source("mcap", tmp_path / "a.mcap", topics={"imu": "none"})
+        assert alone.survey().unplaced == []
+
+
 def test_gyro_and_accelerometer_may_come_in_messages_of_their_own(tmp_path: Path) -> None:
     store = get_typestore(Stores.ROS2_HUMBLE)
     samples = {

@@ -18,6 +18,7 @@ from sceneslam.sources.bag.rig import (
     make_rig,
     picture_size_wh,
     sensor_topics,
+    unplaced,
 )
 from sceneslam.sources.bag.synchronise import Sample, SynchronisedSamples, Synchroniser
 from sceneslam.sources.bag.topics import choose_topics, describe
@@ -127,11 +128,17 @@ class RosBag:
             depth_scale=self._depth_scale,
             sync_tolerance_s=self._sync_tolerance_s,
             mounts=self._mounts,
+            unplaced=self._unplaced(),
         )
 
     def ground_truth(self) -> GroundTruth | None:
         """Return the poses and scenes of the ground truth topics, None without."""
         return read_truth(self._recording, self._topics, self._frames, self._rig, self._truth_frame)
+
+    def _unplaced(self) -> list[str]:
+        """Return the frames of sensors without a pose; a sensor alone may be the base itself."""
+        found = unplaced(self._recording, self._topics, self._frames)
+        return found if self._frames.base is not None or len(found) > 1 else []
 
     def _jobs(self) -> Iterator[Callable[[], Decoded]]:
         """Yield one decoding job per observation."""

@@ -31,6 +31,10 @@ class FrameTree:
             raise ConfigError("base_frame", base_frame, f"null or one of the recording's: {known}")
         self.base = base_frame or next((name for name in _BASES if name in frames), None)
 
+    def is_base(self, frame: str) -> bool:
+        """Tell whether a frame is the base; without transforms, whether it has a base's name."""
+        return frame == self.base or (self.base is None and frame in _BASES)
+
     def T_base(self, frame: str) -> Transform | None:
         """Return T_base_frame (4, 4) [m]; None if no chain of transforms connects both."""
         if self.base is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any
@@ -82,6 +83,19 @@ def place(recording: Recording, topic: str, frames: FrameTree) -> Transform:
     message = first(recording, topic)
     T_base_sensor = None if message is None else frames.T_base(decode.frame_id(message))
     return se3.identity() if T_base_sensor is None else T_base_sensor
+
+
+def unplaced(recording: Recording, topics: BagTopics, frames: FrameTree) -> list[str]:
+    """Return the frames of sensors that no transform connects with the base."""
+    chosen = (topics.image or topics.depth, topics.scan, topics.points, topics.imu)
+    return unconnected(recording, [topic for topic in chosen if topic], frames)
+
+
+def unconnected(recording: Recording, topics: Sequence[str], frames: FrameTree) -> list[str]:
+    """Return the frames of the topics' first messages that no transform connects with the base."""
+    messages = [first(recording, topic) for topic in topics]
+    found = dict.fromkeys(decode.frame_id(one) for one in messages if one is not None)
+    return [name for name in found if not frames.is_base(name) and frames.T_base(name) is None]
 
 
 def find_mounts(recording: Recording, topics: BagTopics, frames: FrameTree) -> Mounts:

@@ -6,7 +6,8 @@ from collections.abc import Iterator, Sequence
 
 from sceneslam.ros import decode
 from sceneslam.sources.bag.frames import FrameTree
-from sceneslam.sources.bag.topics import TYPES, BagTopics, first
+from sceneslam.sources.bag.rig import unconnected
+from sceneslam.sources.bag.topics import TYPES, first
 from sceneslam.sources.ros2.live_recording import LiveRecording
 from sceneslam.types.errors import ConfigError
 
@@ -21,7 +22,7 @@ USUAL = {  # a RealSense camera's and a robot's names; other topics are found by
     "odometry": ("/odom",),
     "imu": ("/imu", "/camera/imu", "/camera/camera/imu"),
 }
-_PLACED = (*TYPES["image"], *TYPES["scan"], *TYPES["points"])
+_PLACED = (*TYPES["image"], *TYPES["scan"], *TYPES["points"], *TYPES["imu"])
 
 
 def lacks_calibration(heard: LiveRecording) -> bool:
@@ -41,13 +42,7 @@ def lacks_transforms(heard: LiveRecording, base_frame: str | None) -> bool:
     except ConfigError:  # the base itself is not known yet
         return True
     sensors = [topic for topic, kind in list(heard.topics.items()) if kind.msgtype in _PLACED]
-    return bool(_unconnected(heard, sensors, frames))
-
-
-def unplaced(heard: LiveRecording, topics: BagTopics, frames: FrameTree) -> list[str]:
-    """Return the frames of sensors that no transform connects with the base."""
-    chosen = (topics.image or topics.depth, topics.scan, topics.points)
-    return _unconnected(heard, [topic for topic in chosen if topic], frames)
+    return bool(unconnected(heard, sensors, frames))
 
 
 def oddities(heard: LiveRecording, named: Sequence[str]) -> Iterator[str]:
@@ -61,9 +56,3 @@ def oddities(heard: LiveRecording, named: Sequence[str]) -> Iterator[str]:
             yield f"{topic} is {msgtype}, which is not a sensor's type: it is not read"
     if not heard.is_latched:
         yield "/tf_static is not transient local: who joins late does not hear it"
-
-
-def _unconnected(heard: LiveRecording, topics: Sequence[str], frames: FrameTree) -> list[str]:
-    messages = [first(heard, topic) for topic in topics]
-    names = dict.fromkeys(decode.frame_id(one) for one in messages if one is not None)
-    return [name for name in names if frames.T_base(name) is None]

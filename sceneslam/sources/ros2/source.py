@@ -18,6 +18,7 @@ from sceneslam.sources.bag.rig import (
     make_rig,
     picture_size_wh,
     sensor_topics,
+    unplaced,
 )
 from sceneslam.sources.bag.synchronise import Sample, SynchronisedSamples, Synchroniser
 from sceneslam.sources.bag.topics import NONE, TYPES, choose_topics
@@ -32,7 +33,6 @@ from sceneslam.sources.ros2.expected import (
     lacks_calibration,
     lacks_transforms,
     oddities,
-    unplaced,
 )
 from sceneslam.sources.ros2.live_recording import LiveRecording
 from sceneslam.sources.ros2.network_watch import NetworkWatch
