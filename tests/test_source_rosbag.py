@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from ros_recordings import STAMP_NS, Recorder, make_source
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from sceneslam.ros.encode import Encoder
@@ -56,6 +57,25 @@ def test_all_storages_give_the_same_scans(shared_data: Path, name: str) -> None:
     assert source.rig.sensors == {Sensor.SCAN}
     assert np.isnan(found[0].scan.ranges_m[16])
     assert source.ground_truth() is None
+
+
+@pytest.mark.parametrize("mode", [CompressionMode.MESSAGE, CompressionMode.FILE])
+@pytest.mark.parametrize("storage", list(StoragePlugin))
+def test_recordings_of_every_compression_are_read(
+    tmp_path: Path, mode: CompressionMode, storage: StoragePlugin
+) -> None:
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    writer = Writer(tmp_path / "bag", version=9, storage_plugin=storage)
+    writer.set_compression(mode, CompressionFormat.ZSTD)
+    pose = se3.from_xy_yaw(1.0, 2.0, 0.0)
+    with writer:
+        odom = writer.add_connection("/odom", "nav_msgs/msg/Odometry", typestore=store)
+        for number in range(5):
+            stamp_ns = STAMP_NS + number * 10**8
+            writer.write(odom, stamp_ns, Encoder().odometry(stamp_ns, pose, "odom"))
+    found = list(make_source("rosbag", tmp_path / "bag"))
+    assert len(found) == 5
+    np.testing.assert_allclose(found[0].T_odom_base, pose)
 
 
 def test_points_come_before_scans_and_truth_is_no_odometry(shared_data: Path) -> None:

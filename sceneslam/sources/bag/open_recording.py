@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import deque
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -44,15 +45,22 @@ def open_recording(path: Path) -> Recording:
 
 def _open_folder(path: Path) -> Recording:
     files = sorted(path.glob("*.mcap"))
-    if files:
+    metadata = path / "metadata.yaml"
+    if files and not _packs_messages(metadata):
         return open_mcap(files)
-    if not (path / "metadata.yaml").is_file():
+    if not metadata.is_file():
         raise InputError(f"recording: the folder has neither metadata.yaml nor *.mcap: {path}")
     return FolderRecording(path)
 
 
+def _packs_messages(metadata: Path) -> bool:
+    """Tell whether rosbag2 compressed each message, of which an MCAP file says nothing."""
+    text = metadata.read_text(errors="replace") if metadata.is_file() else ""
+    return re.search(r"^\s*compression_mode:\W*message\b", text, re.I | re.M) is not None
+
+
 class FolderRecording:
-    """A rosbag2 folder with sqlite3 storage (or compressed files)."""
+    """A rosbag2 folder with sqlite3 storage (or compressed files or messages)."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
