@@ -175,6 +175,16 @@ def test_first_observation_is_one_that_every_stream_was_there_for(make):
     assert first.stamp_ns == now_ns + 66 * MS and first.has(Sensor.DEPTH)
 
 
+def test_messages_from_which_topics_were_chosen_do_not_stay_in_memory(make):
+    robot = Robot(*ALL)
+    source = make(robot)
+    heard(source, robot)
+    assert source.survey().streams and list(source.heard.messages(ALL))
+    drive(robot, 4)
+    next(iter(source))
+    assert not list(source.heard.messages(ALL))
+
+
 def test_observation_holds_what_was_measured_at_its_stamp(make):
     robot = Robot(*ALL)
     source = make(robot)

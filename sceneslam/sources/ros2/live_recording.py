@@ -123,6 +123,11 @@ class LiveRecording:
         held = self._held.get(topic)
         return held[-1] if held else None
 
+    def forget(self) -> None:
+        """Drop the messages; `topics` and `announced` stay."""
+        with self._changed:
+            self._held.clear()
+
     def decode(self, message: Message) -> Any:
         """Return the decoded message, None if its bytes are invalid."""
         return self._decoder.decode(message.topic, message.data)

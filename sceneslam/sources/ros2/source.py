@@ -139,7 +139,8 @@ class Ros2(Measuring):
             self._transport.close()
 
     def __iter__(self) -> Iterator[Observation]:
-        """Yield observations as they arrive, until `close`."""
+        """Yield observations as they arrive, until `close`; there is no survey from here on."""
+        self.heard.forget()
         for bundle, primary in self._bundles():
             if self._streams is None or not self._streams.has_begun(bundle.primary.stamp_ns):
                 continue
