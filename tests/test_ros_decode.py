@@ -216,6 +216,17 @@ def test_a_calibration_that_is_no_number_is_missing(changes: dict[str, Any]) -> 
     assert decode.camera(camera_info(**changes)) is None
 
 
+def test_rectified_images_have_the_lens_of_the_projection() -> None:
+    p = np.array([4.0, 0, 1.5, -0.4, 0, 4.5, 1.2, 0, 0, 0, 1, 0])
+    raw = camera_info(p=p, d=[0.1] * 4)
+    raw.distortion_model = "equidistant"
+    found = decode.camera(raw, is_rectified=True)
+    assert (found.fx, found.fy, found.cx, found.cy) == (4.0, 4.5, 1.5, 1.2)
+    assert not any(found.distortion)
+    without = camera_info(p=np.zeros(12), d=[0.1] * 5)
+    assert decode.camera(without, is_rectified=True) == decode.camera(without)
+
+
 def test_a_lens_that_opencv_does_not_have_is_named() -> None:
     assert decode.camera(camera_info(d=[0.1] * 4)).distortion == (0.1, 0.1, 0.1, 0.1, 0.0)
     with pytest.raises(InputError, match="got 6 coefficients, allowed: 0 to 5, 8, 12 or 14"):

@@ -12,7 +12,7 @@ from rosbags.typesys import Stores, get_typestore
 from sceneslam.ros.encode import Encoder
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError, InputError
-from sceneslam.types.rig import Sensor, optical_to_rep103
+from sceneslam.types.rig import Camera, Sensor, optical_to_rep103
 
 COLOR = np.full((30, 40, 3), 90, np.uint8)
 DEPTH = np.full((30, 40), 1500, np.uint16)
@@ -182,6 +182,24 @@ def test_depth_goes_to_the_nearest_image_within_the_tolerance(tmp_path: Path) ->
     assert all(one.has(Sensor.DEPTH) for one in make_source("mcap", path))
     strict = make_source("mcap", path, sync_tolerance_s=0.004)
     assert not any(one.has(Sensor.DEPTH) for one in strict)
+
+
+@pytest.mark.parametrize(("topic", "fx"), [("/cam/image_raw", 50.0), ("/cam/image_rect", 45.0)])
+def test_rectified_images_are_known_by_their_topic(tmp_path: Path, topic: str, fx: float) -> None:
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        recorder.add("/cam/camera_info", STAMP_NS, camera_info(p=[45.0, 0, 20, 0, 0, 45.0, 15, 0]))
+        recorder.image(topic, STAMP_NS, COLOR, "bgr8")
+    assert make_source("mcap", tmp_path / "a.mcap").rig.camera.fx == fx
+
+
+def camera_info(p: list[float]) -> Any:
+    """Return a CameraInfo with the first two rows of a projection."""
+    camera = Camera(size_wh=(40, 30), fx=50.0, fy=51.0, cx=20.0, cy=15.0)
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    data = Encoder().camera_info(STAMP_NS, camera)
+    message = store.deserialize_cdr(data, "sensor_msgs/msg/CameraInfo")
+    message.p = np.array([*p, 0.0, 0.0, 1.0, 0.0])
+    return message
 
 
 def test_image_that_changes_its_size_is_left_out_and_told_with_both_sizes(tmp_path: Path) -> None:

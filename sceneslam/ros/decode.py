@@ -190,12 +190,15 @@ def scan(message: Any) -> LaserScan | None:
     )
 
 
-def camera(message: Any) -> Camera | None:
+def camera(message: Any, *, is_rectified: bool = False) -> Camera | None:
     """Return the camera of a CameraInfo, None if it is not calibrated: K is zero, or no number.
 
-    Raises InputError for a lens that OpenCV does not have.
+    Rectified images have the lens of P, if it is given, without distortion. Raises InputError for
+    a lens that OpenCV does not have.
     """
-    k, d = (_coefficients(message, letter) for letter in "kd")
+    k, d, p = (_coefficients(message, letter) for letter in "kdp")
+    if is_rectified and p[0] > 0:
+        k, d = p.reshape(3, 4)[:, :3].ravel(), np.zeros(0)
     if not (k[0] > 0 and k[4] > 0 and np.isfinite([*k, *d]).all()):
         return None
     model = str(message.distortion_model)
@@ -240,7 +243,7 @@ def _encoding(message: Any) -> tuple[str, bool]:
 
 
 def _coefficients(message: Any, letter: str) -> NDArray[np.float64]:
-    """Return CameraInfo's `k` or `d`, which are `K` and `D` in ROS 1."""
+    """Return CameraInfo's `k`, `d` or `p`, which are `K`, `D` and `P` in ROS 1."""
     values = vars(message)
     return np.asarray(values.get(letter, values.get(letter.upper())), dtype=np.float64)
 

@@ -28,6 +28,7 @@ _NEEDS = {  # sensor -> field of BagTopics that names its topic
     Sensor.GYRO: "imu",
     Sensor.ACCELEROMETER: "imu",
 }
+_RECTIFIED = "image_rect"  # in the topics of image_proc and stereo_image_proc
 _FIRST_IMU = 100  # messages searched for both sensors, which may come in messages of their own
 _DEPTH_RANGE_M, _LIDAR_RANGE_M = (0.3, 8.0), (1.0, 100.0)
 
@@ -131,10 +132,11 @@ def _camera(
     depth_range_m: tuple[float, float],
 ) -> Camera | None:
     """Return the camera of the colour images; without these, that of the depth images."""
-    message = first(recording, topics.image or topics.depth or "")
+    picture = topics.image or topics.depth or ""
+    message = first(recording, picture)
     size_wh = picture_size_wh(recording, topics)
     info = first(recording, topics.camera_info) if topics.camera_info else None
-    recorded = decode.camera(info) if info is not None else None
+    recorded = decode.camera(info, is_rectified=_RECTIFIED in picture) if info is not None else None
     if recorded is None and given is None:
         if topics.depth is None:
             return None
