@@ -21,7 +21,7 @@ from sceneslam.config.resolve import resolved
 from sceneslam.detection.features import RecordingFeatures
 from sceneslam.detection.grid import Axis, try_all
 from sceneslam.detection.run import _shares, detect
-from sceneslam.types.errors import ConfigError, InputError, ModuleError
+from sceneslam.types.errors import ConfigError, ModuleError
 from sceneslam.types.files import AppendedFile
 from sceneslam.types.observation import SceneVote
 from sceneslam.types.truth import GroundTruth, SceneChange
