@@ -192,6 +192,21 @@ def test_rectified_images_are_known_by_their_topic(tmp_path: Path, topic: str, f
     assert make_source("mcap", tmp_path / "a.mcap").rig.camera.fx == fx
 
 
+def test_given_intrinsics_replace_those_of_a_lens_that_opencv_does_not_have(tmp_path: Path) -> None:
+    info = camera_info(p=[0.0] * 8)
+    info.distortion_model, info.d = "equidistant", np.full(4, 0.1)
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        recorder.add("/cam/camera_info", STAMP_NS, info)
+        recorder.image("/cam/image_raw", STAMP_NS, COLOR, "bgr8")
+    given = {"fx": 40.0, "fy": 41.0, "cx": 20.0, "cy": 15.0}
+    for camera in ({}, given):
+        with pytest.raises(InputError, match=r"equidistant.*source\.camera\.fx.*distortion"):
+            make_source("mcap", tmp_path / "a.mcap", camera=camera)
+    lens = given | {"distortion": [0.0] * 5}
+    found = make_source("mcap", tmp_path / "a.mcap", camera=lens).rig.camera
+    assert found.fy == 41.0 and not any(found.distortion)
+
+
 def camera_info(p: list[float]) -> Any:
     """Return a CameraInfo with the first two rows of a projection."""
     camera = Camera(size_wh=(40, 30), fx=50.0, fy=51.0, cx=20.0, cy=15.0)

@@ -136,7 +136,12 @@ def _camera(
     message = first(recording, picture)
     size_wh = picture_size_wh(recording, topics)
     info = first(recording, topics.camera_info) if topics.camera_info else None
-    recorded = decode.camera(info, is_rectified=_RECTIFIED in picture) if info is not None else None
+    recorded = None
+    if info is not None and (given is None or given.distortion is None):
+        try:
+            recorded = decode.camera(info, is_rectified=_RECTIFIED in picture)
+        except InputError as err:
+            raise InputError(f"{err}; or give source.camera.fx, fy, cx, cy, distortion") from err
     if recorded is None and given is None:
         if topics.depth is None:
             return None

@@ -10,6 +10,7 @@ import numpy as np
 from sceneslam.ros import decode, names
 from sceneslam.ros.messages import MessageDecoder, TopicType
 from sceneslam.ros.transport.transport import Arrival, Publication, Qos, Transport
+from sceneslam.types.errors import InputError
 from sceneslam.types.rig import Camera
 from sceneslam.types.se3 import Transform
 
@@ -46,7 +47,7 @@ class NetworkWatch:
             if hasattr(message, "transforms"):
                 self._mounts |= _mounts(message)
             else:
-                self._camera = decode.camera(message)
+                self._camera = _camera(message)
 
     def subscribe(self, transport: Transport) -> None:
         """Listen to the calibration and to fixed transforms."""
@@ -67,7 +68,7 @@ class NetworkWatch:
 
     def _take_camera(self, arrival: Arrival) -> None:
         message = self._decoder.decode(arrival.topic, arrival.cdr)
-        camera = None if message is None else decode.camera(message)
+        camera = None if message is None else _camera(message)
         if camera is None or _lens(camera) == _lens(self._camera):
             return
         if self._camera is not None:
@@ -89,6 +90,14 @@ class NetworkWatch:
             self._tell("tf_late", frames=late, missed=self._unplaced)
         if moved:
             self._tell("tf_changed", frames=moved)
+
+
+def _camera(message: Any) -> Camera | None:
+    """Return the camera of a CameraInfo, None for a lens that the configuration has to replace."""
+    try:
+        return decode.camera(message)
+    except InputError:
+        return None
 
 
 def _lens(camera: Camera | None) -> object:
