@@ -11,6 +11,7 @@ import pytest
 from evaluation_runs import first_events, loop, poseless_run, switch_events, switched_run, votes
 
 from sceneslam.interfaces import ResultSink, Sink
+from sceneslam.sinks import rerun_layout as at
 from sceneslam.sinks.rerun import RerunSink
 from sceneslam.sinks.rerun_legend import legend
 from sceneslam.sinks.rerun_viewer import Viewer
@@ -200,6 +201,15 @@ def test_events_from_before_the_first_observation_do_not_move_the_time_line(monk
     sink.write_event(warning)
     times_s = [call.kwargs["duration"] for call in recording.set_time.call_args_list]
     assert times_s == [0.0, 0.0, 1.0, 0.0]
+
+
+def test_curve_of_a_scene_falls_when_another_one_is_voted_for(monkeypatch):
+    sink, recording = stood_in_for(monkeypatch)
+    for scene in ("Bright", "Bright", "Dark"):
+        sink.write_event({"event": "vote", "stamp_ns": 0, "scene": scene})
+    levels = [call.args[0][0] for call in sink._rr.Scalars.call_args_list]
+    assert levels == [1.0, 1.0, 1.0, 0.0]
+    assert recording.log.call_args.args[0] == f"{at.VOTES}/Bright"
 
 
 def test_tracker_states_do_not_crowd_the_decisions(tmp_path):

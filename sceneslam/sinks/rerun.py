@@ -69,6 +69,7 @@ class RerunSink:
         self._recording: rr.RecordingStream | None = None
         self._colors: dict[str, tuple[int, int, int]] = {"": at.BRIDGED_RGB}
         self._start_ns: int | None = None
+        self._voted: str | None = None  # the scene of the last vote
         self._first: tuple[int, Transform] | None = None
         self._last_position: list[float] | None = None
         self._truth: GroundTruth | None = None
@@ -164,7 +165,9 @@ class RerunSink:
         value = event.get("value")
         if value is not None and math.isfinite(value):
             recording.log(at.VALUE, self._rr.Scalars([value]))
-        self._write_level(recording, at.VOTES, event["scene"], None)
+        previous = self._voted if self._voted != event["scene"] else None
+        self._voted = event["scene"]
+        self._write_level(recording, at.VOTES, event["scene"], previous)
         for scene, probability in event.get("posterior", {}).items():
             recording.log(f"{at.POSTERIOR}/{scene}", self._rr.Scalars([probability]))
 
