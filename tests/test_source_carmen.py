@@ -47,7 +47,9 @@ def test_the_intel_log_is_read_whole_and_without_fault(
     assert np.isinf(scan.ranges_m[87])
 
 
-@pytest.mark.parametrize(("count", "degrees"), [(180, 1.0), (181, 1.0), (360, 0.5), (361, 0.5)])
+@pytest.mark.parametrize(
+    ("count", "degrees"), [(180, 1.0), (181, 1.0), (360, 0.5), (361, 0.5), (400, 0.25), (401, 0.25)]
+)
 def test_the_count_tells_the_step(tmp_path: Path, count: int, degrees: float) -> None:
     path = write(tmp_path / "a.log", flaser([2.0] * count, "10.5"))
     (one,) = make_source("carmen", path)

@@ -13,7 +13,14 @@ from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import parse_stamp_ns
 
 FLASER, ROBOTLASER = b"FLASER ", b"ROBOTLASER1 "
-_HALF_TURN_COUNTS = {180: 1.0, 181: 1.0, 360: 0.5, 361: 0.5, 401: 0.25}  # SICK: degrees per beam
+_HALF_TURN_COUNTS = {
+    180: 1.0,
+    181: 1.0,
+    360: 0.5,
+    361: 0.5,
+    400: 0.25,
+    401: 0.25,
+}  # SICK: degrees per beam
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
