@@ -421,6 +421,15 @@ def test_a_scan_without_a_stamp_has_that_of_its_recording(tmp_path: Path) -> Non
     assert one.stamp_ns == one.scan.stamp_ns == STAMP_NS
 
 
+@pytest.mark.parametrize("range_max", [0.0, float("nan")])
+def test_a_laser_without_a_range_is_a_fault(tmp_path: Path, range_max: float) -> None:
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        recorder.scan("/scan", STAMP_NS, [1.0, 2.0], range_max=range_max)
+    source = make_source("mcap", tmp_path / "a.mcap")
+    assert list(source) == []
+    assert "no range_max above its range_min" in source.faults[0]
+
+
 def test_messages_outside_of_the_chunks_of_a_file_are_read_in_their_order(tmp_path: Path) -> None:
     with Recorder(tmp_path / "a.mcap") as recorder:
         chunk = recorder._writer._Writer__chunk_builder

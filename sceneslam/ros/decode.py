@@ -164,7 +164,7 @@ def inertial(imu: Any) -> dict[Sensor, NDArray[np.float64]]:
 
 
 def scan(message: Any) -> LaserScan | None:
-    """Return the scan of a LaserScan message, None if its angles are invalid.
+    """Return the scan of a LaserScan message, None if its angles or range limits are invalid.
 
     Ranges above the maximum (REP-117: also +inf) become inf; NaN, zero and below the minimum become
     NaN. The beams of a clockwise laser are reversed.
@@ -172,6 +172,8 @@ def scan(message: Any) -> LaserScan | None:
     low_m, high_m = float(message.range_min), float(message.range_max)
     step_rad, start_rad = float(message.angle_increment), float(message.angle_min)
     ranges_m = np.array(message.ranges, dtype=np.float32)
+    if not high_m > low_m:  # it would be blind
+        return None
     if not np.isfinite([start_rad, step_rad, low_m]).all() or step_rad == 0 or not len(ranges_m):
         return None
     if step_rad < 0:

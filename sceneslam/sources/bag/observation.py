@@ -131,7 +131,9 @@ class BundleDecoder:
         sample = self._sample(Sensor.SCAN, bundle)
         scan = None if sample is None else decode.scan(sample.value)
         if sample is not None and scan is None:
-            problems.append("a laser scan has no usable angles")
+            problems.append(
+                "a laser scan has no usable angles, or no range_max above its range_min"
+            )
         return None if sample is None or scan is None else replace(scan, stamp_ns=sample.stamp_ns)
 
     def _points(self, bundle: SynchronisedSamples, problems: list[str]) -> Cloud | None:
