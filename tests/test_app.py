@@ -259,7 +259,7 @@ def test_ground_truth_that_cannot_be_written_costs_no_metrics(tmp_path, monkeypa
 
     def fail(trajectory, path):
         if path.name == "groundtruth.tum":
-            raise OSError("disk is full")
+            raise OSError("the disk is full")
         write(trajectory, path)
 
     monkeypatch.setattr(Trajectory, "write_tum", fail)
