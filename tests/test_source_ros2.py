@@ -76,7 +76,8 @@ class Robot:
             listener(Arrival(topic=topic, cdr=cdr, arrived_ns=came_ns, publisher=publisher))
 
     def measure(self, stamp_ns, *, without=(), **how):
-        """Send what every topic would at one instant."""
+        """Send what every topic would at one instant, at which all of it arrives."""
+        how = {"arrived_ns": monotonic_ns()} | how
         for topic in [one for one in self._topics if one not in without]:
             self.send(topic, self._message(self.encoder, topic, stamp_ns), **how)
 
