@@ -88,19 +88,17 @@ def compare(
     # A slope is half a difference of two greys, and so has half the variance of their noise, a
     # quarter of that of `brighter`: by it, darkness would say where it is.
     by_noise = 0.5 * noise / grey_sigma * jacobians[:, :2].reshape(-1, 6)
-    seen = semidefinite(photometric.T @ photometric - by_noise.T @ by_noise)
+    by_grey, by_depth = photometric.T @ photometric, geometric.T @ geometric
+    seen = semidefinite(by_grey - by_noise.T @ by_noise)
     pulls = (photometric * (brighter / grey_sigma)[:, None] + geometric * deeper[:, None]).T
     side_px = -(-width // _CELLS)
-    together = squared(
-        summed(pulls, row // side_px * _CELLS + column // side_px),
-        photometric.T @ photometric + geometric.T @ geometric,
-    )
+    blocks = row // side_px * _CELLS + column // side_px
     return Comparison(
-        information=(seen + geometric.T @ geometric) / CORRELATION,
+        information=(seen + by_depth) / CORRELATION,
         misfit=float(np.log(grey_sigma) + 0.5 * (_squared(brighter / grey_sigma) + apart)),
         compared=compared,
         matched=len(rows),
-        common_ratio=together / 6.0,
+        common_ratio=squared(summed(pulls, blocks), by_grey + by_depth) / 6.0,
         deeper_square=_squared(deeper),
         away2_m2=float(np.median((points_view[rows] ** 2).sum(axis=1))),
     )
