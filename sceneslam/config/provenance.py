@@ -26,6 +26,7 @@ _EDGE_BYTES = 32 << 20  # of the beginning and end of large input files are hash
 _READERS = ("source", "effects", "detector", "slam")  # components that read files
 _WRITTEN = ("record",)  # keys of files that a run writes
 _CODE = (".py", ".so")
+CACHES = "__pycache__"  # folders that Python writes beside its code
 
 
 def save_config(config: Mapping[str, Any], path: Path) -> dict[str, str]:
@@ -102,14 +103,14 @@ def _input_pieces(config: Mapping[str, Any]) -> Iterator[bytes]:
     """Yield the names, sizes and contents of the files that a run reads."""
     for key in _READERS:
         for path in _named_paths(config.get(key)):
-            yield from _pieces(path)
+            yield from pieces_of(path)
     atlas = config.get("atlas") or {}
     load = map_folder(atlas, "load")
     if load is not None and load != map_folder(atlas, "save"):
-        yield from _pieces(load)
+        yield from pieces_of(load)
     for name in config.get("allow_targets") or ():
         for path in _code_paths(str(name)):
-            yield from _pieces(path, _CODE)
+            yield from pieces_of(path, _CODE)
 
 
 def _named_paths(value: Any, key: str = "") -> Iterator[Path]:
@@ -141,13 +142,15 @@ def _code_paths(name: str) -> Iterator[Path]:
         yield Path(program)
 
 
-def _pieces(root: Path, suffixes: Sequence[str] = ()) -> Iterator[bytes]:
+def pieces_of(root: Path, suffixes: Sequence[str] = ()) -> Iterator[bytes]:
     """Yield names, sizes and contents of a file, or of a folder's files with one of the suffixes.
 
     Of a file that may not be read, such as some programs, the content is left out.
     """
     for file in sorted(root.rglob("*")) if root.is_dir() else [root]:
-        if not file.is_file() or (file != root and suffixes and file.suffix not in suffixes):
+        if not file.is_file() or CACHES in file.relative_to(root).parts:
+            continue
+        if file != root and suffixes and file.suffix not in suffixes:
             continue
         yield f"{file.relative_to(root)} {file.stat().st_size}\n".encode()
         if os.access(file, os.R_OK):

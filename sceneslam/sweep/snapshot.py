@@ -9,9 +9,9 @@ from pathlib import Path
 from tempfile import mkdtemp
 
 import sceneslam
+from sceneslam.config.provenance import CACHES, pieces_of
 
 _BESIDE = ("conf", "modules", "experiments")  # of a checkout; in a wheel they lie inside
-_CACHES = "__pycache__"
 
 
 def keep_code(folder: Path) -> Path:
@@ -24,7 +24,7 @@ def keep_code(folder: Path) -> Path:
     part = Path(mkdtemp(dir=folder))
     for name, path in parts.items():
         if path.is_dir():
-            shutil.copytree(path, part / name, ignore=shutil.ignore_patterns(_CACHES))
+            shutil.copytree(path, part / name, ignore=shutil.ignore_patterns(CACHES))
         else:
             shutil.copy2(path, part / name)
     part.rename(target)
@@ -42,9 +42,7 @@ def _sha256(parts: Mapping[str, Path]) -> str:
     """Return a hash of the names and contents of all that is copied."""
     digest = hashlib.sha256()
     for name, path in parts.items():
-        for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
-            if file.is_file() and _CACHES not in file.parts:
-                inner = file.relative_to(path).as_posix()
-                digest.update(f"{name}/{inner} {file.stat().st_size}\n".encode())
-                digest.update(file.read_bytes())
+        digest.update(f"{name}\n".encode())
+        for piece in pieces_of(path):
+            digest.update(piece)
     return digest.hexdigest()
