@@ -123,6 +123,24 @@ def test_a_pose_without_a_rotation_is_named_by_its_line(tmp_path: Path, wrong: n
         make_source("kitti", folder).ground_truth()
 
 
+def test_scans_of_a_drive_with_lost_ones_have_the_lines_of_their_numbers(tmp_path: Path) -> None:
+    folder = make_folder(tmp_path / "a", count=4)
+    (folder / "times.txt").write_text("0.0\n0.1\n0.2\n0.3\n")
+    rows = np.tile(np.eye(4)[:3].ravel(), (4, 1))
+    rows[:, 3] = [0, 1, 2, 3]
+    np.savetxt(folder / "poses.txt", rows)
+    for lost in ("000000.bin", "000002.bin"):
+        (folder / "velodyne" / lost).unlink()
+    source = make_source("kitti", folder)
+    assert [one.stamp_ns for one in source] == [100_000_000, 300_000_000]
+    truth = source.ground_truth().trajectory
+    np.testing.assert_array_equal(truth.stamps_ns, [100_000_000, 300_000_000])
+    np.testing.assert_array_equal(truth.positions_m[:, 0], [1, 3])
+    (folder / "velodyne" / "000003.bin").rename(folder / "velodyne" / "000009.bin")
+    with pytest.raises(InputError, match="expected 2 as there are scans, got 4"):
+        make_source("kitti", folder)
+
+
 def test_damaged_scans_are_passed_over_and_named(tmp_path: Path) -> None:
     folder = make_folder(tmp_path / "a")
     (folder / "velodyne" / "000001.bin").write_bytes(POINTS.tobytes()[:-3])

@@ -35,6 +35,8 @@ class Kitti(StampedScans):
 
     `path` is a drive: `velodyne/*.bin` (odometry benchmark) or `velodyne_points/data/*.bin` (raw
     data), or its folder of scans. Times are read from times.txt or timestamps.txt, else 10 Hz.
+    Times and poses have a line per scan; where they have more (a drive with lost scans, a part of
+    a drive), a scan's line is the number in its name, from 0.
     Ground truth is groundtruth_tum.txt, the lidar's poses, or poses*.txt: the camera's poses if
     calib.txt beside it has `Tr` (odometry benchmark, SemanticKITTI), else the lidar's.
     """
@@ -46,7 +48,7 @@ class Kitti(StampedScans):
         self._times = next((one for name in _TIMES if (one := self._folder / name).is_file()), None)
         super().__init__(
             Rig(sensors=frozenset({Sensor.POINTS}), lidar=Lidar(range_m=(low_m, high_m))),
-            _read_times_ns(self._times, len(self._files)),
+            _read_times_ns(self._times, self._files),
         )
 
     def __iter__(self) -> Iterator[Observation]:
@@ -95,7 +97,8 @@ class Kitti(StampedScans):
             rows = np.loadtxt(path, ndmin=2, dtype=np.float64)
         except ValueError as err:
             raise InputError(f"poses: expected 12 numbers per line ({err}): {path}") from err
-        if rows.shape != (len(self._files), 12) or not np.isfinite(rows).all():
+        lines = _lines(self._files, len(rows))
+        if lines is None or rows.shape[1] != 12 or not np.isfinite(rows).all():
             raise InputError(
                 f"poses: expected {len(self._files)} lines of 12 finite numbers, got "
                 f"{rows.shape[0]} of {rows.shape[1]}: {path}"
@@ -108,7 +111,7 @@ class Kitti(StampedScans):
             numbers = [n for n, line in enumerate(text, start=1) if line.partition("#")[0].strip()]
             raise InputError(f"poses: line {numbers[wrong[0]]} has no rotation: {path}")
         T_cam_lidar = _read_T_cam_lidar(path.with_name("calib.txt"))
-        T_gt_base = se3.inverse(T_cam_lidar) @ T_gt_base @ T_cam_lidar
+        T_gt_base = se3.inverse(T_cam_lidar) @ T_gt_base[lines] @ T_cam_lidar
         return Trajectory(stamps_ns=self._stamps_ns, T_world_base=T_gt_base)
 
     def _jobs(self) -> Iterator[Callable[[], NDArray[np.float32] | None]]:
@@ -146,18 +149,32 @@ def _read_T_cam_lidar(path: Path) -> se3.Transform:
     return T_cam_lidar
 
 
-def _read_times_ns(path: Path | None, count: int) -> NDArray[np.int64]:
-    """Return the stamps (N,) [ns] of `count` scans; without a file of times, 10 Hz from zero.
+def _lines(files: Sequence[Path], count: int) -> NDArray[np.int64] | None:
+    """Return which of `count` lines of a file is each scan's; None if they do not fit."""
+    if count == len(files):
+        return np.arange(count)
+    names = [path.stem for path in files]
+    if count < len(files) or not all(name.isdecimal() for name in names):
+        return None
+    numbers = np.array([int(name) for name in names])
+    return numbers if numbers.max() < count else None
 
-    Raises InputError if the file has another number of lines or an invalid time.
+
+def _read_times_ns(path: Path | None, files: Sequence[Path]) -> NDArray[np.int64]:
+    """Return the stamps (N,) [ns] of the scans; without a file of times, 10 Hz from zero.
+
+    Raises InputError if the file's lines are not those of the scans, or a time is invalid.
     """
     if path is None:
-        return np.arange(count, dtype=np.int64) * _PERIOD_NS
-    lines = [line.strip() for line in read_text(path).splitlines()]
-    stamps = [_stamp_ns(line, path) for line in lines if line and line[0] != "#"]
-    if len(stamps) != count:
-        raise InputError(f"times: expected {count} as there are scans, got {len(stamps)}: {path}")
-    return np.array(stamps, dtype=np.int64)
+        return np.arange(len(files), dtype=np.int64) * _PERIOD_NS
+    texts = [line.strip() for line in read_text(path).splitlines()]
+    stamps = [_stamp_ns(line, path) for line in texts if line and line[0] != "#"]
+    lines = _lines(files, len(stamps))
+    if lines is None:
+        raise InputError(
+            f"times: expected {len(files)} as there are scans, got {len(stamps)}: {path}"
+        )
+    return np.array(stamps, dtype=np.int64)[lines]
 
 
 def _stamp_ns(line: str, path: Path) -> int:
