@@ -93,7 +93,6 @@ def record(path: Path, image_format: str = "png", count: int = 5) -> list[Observ
     for observation in made:
         writer.write(observation)
     writer.write_truth(truth(made))
-    writer.attach("config.yaml", "a: 1")
     writer.close()
     writer.close()
     return made
@@ -233,7 +232,6 @@ def test_recordings_open_with_the_reference_reader(tmp_path: Path) -> None:
         reader = make_reader(file, validate_crcs=True)
         topics = {channel.topic for _, channel, _ in reader.iter_messages()}
         assert {"/scan", "/points", "/odom", "/imu", "/tf_static"} <= topics
-        assert [one.name for one in reader.iter_attachments()] == ["config.yaml"]
 
 
 def test_looked_at_a_recording_of_a_run_shows_map_path_truth_and_velocity(tmp_path: Path) -> None:

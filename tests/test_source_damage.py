@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from ros_recordings import STAMP_NS, make_source
 
+from sceneslam.ros.encode import Encoder
+from sceneslam.ros.messages import MessageDecoder, TopicType
 from sceneslam.ros.writer import ObservationWriter
 from sceneslam.sources.rosbag import RosBag
 from sceneslam.types.errors import InputError
@@ -16,7 +18,7 @@ from sceneslam.types.rig import Camera, Rig, Sensor
 COUNT = 60
 
 
-def record(path: Path) -> None:
+def record(path: Path, *, counts: bool = True) -> None:
     """Write frames of noise: about 45 kB each, several to a chunk."""
     rng = np.random.default_rng(1)
     camera = Camera(size_wh=(160, 90), fx=100, fy=100, cx=80, cy=45)
@@ -25,6 +27,8 @@ def record(path: Path) -> None:
     for index in range(COUNT):
         image = rng.integers(0, 256, (90, 160, 3), dtype=np.uint8)
         writer.write(Observation(stamp_ns=STAMP_NS + index * 10**8, image_bgr=image))
+    if not counts:
+        writer._mcap._Writer__statistics.channel_message_counts.clear()
     writer.close()
 
 
@@ -47,6 +51,13 @@ def test_a_cut_off_mcap_gives_what_is_whole(tmp_path: Path, share: float) -> Non
     assert "the rest of the recording is missing and could not be read" in fault
     assert "%" not in fault
     assert str(tmp_path / "cut.mcap") in fault
+
+
+def test_a_summary_without_counts_by_channel_is_whole(tmp_path: Path) -> None:
+    record(tmp_path / "whole.mcap", counts=False)
+    source, found = read(tmp_path / "whole.mcap")
+    assert len(found) == source.length == COUNT
+    assert source.faults == []
 
 
 def test_a_missing_index_alone_loses_nothing(tmp_path: Path) -> None:
@@ -239,3 +250,23 @@ def test_a_damaged_sqlite_bag_is_one_sentence(shared_data: Path, tmp_path: Path)
         (folder / file.name).write_bytes(data[: len(data) // 3] if file.suffix == ".db3" else data)
     with pytest.raises(InputError, match="cannot be read"):
         list(make_source("rosbag", folder))
+
+
+def test_a_definition_in_idl_may_be_of_several_files() -> None:
+    own = "module own { module msg { struct Named { std_msgs::msg::String name; }; }; };"
+    of_string = "module std_msgs { module msg { struct String { string data; }; }; };"
+    head = "=" * 80 + "\nIDL: {}\n"
+    kind = TopicType(
+        msgtype="own/msg/Named",
+        encoding="cdr",
+        definition=head.format("own/msg/Named")
+        + own
+        + "\n"
+        + head.format("std_msgs/msg/String")
+        + of_string,
+        definition_format="ros2idl",
+        count=1,
+    )
+    data = Encoder().text("laser")
+    message = MessageDecoder({"/named": kind}).decode("/named", data)
+    assert message.name.data == "laser"

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sceneslam.ros import names
 from sceneslam.types import se3
 from sceneslam.types.observation import LaserScan
-from sceneslam.types.rig import Camera, Sensor
+from sceneslam.types.rig import Camera, Rig, Sensor
 from sceneslam.types.se3 import Transform
 
 _DATATYPES = {"<u4": 6, "<f4": 7, "<f8": 8}  # of sensor_msgs/PointField
@@ -118,30 +118,41 @@ class Encoder:
         stamp_ns: int,
         T_frame_base: Transform,
         frame: str,
+        *,
+        base: str = names.BASE,
+        covariance: NDArray[np.float64] | None = None,
         twist_base: NDArray[np.float64] | None = None,
+        marks_twist: bool = False,
     ) -> bytes:
-        """Return an Odometry of base_link in `frame`, without covariance.
+        """Return an Odometry of `base` in `frame`, T_frame_base (4, 4) [m].
 
-        `T_frame_base` is (4, 4) [m], `twist_base` (6,) the velocity [m/s, rad/s]; None: zero.
+        `covariance` (6, 6) [m, rad] in base is rotated to the axes of `frame`, as the message
+        defines. `twist_base` is the velocity (6,) [m/s, rad/s]; unknown: zero, and with
+        `marks_twist` the first entry of its covariance is -1.
         """
         moves = np.zeros(6) if twist_base is None else twist_base
         linear, angular = (
             self._new("geometry_msgs/msg/Vector3", x=float(x), y=float(y), z=float(z))
             for x, y, z in (moves[:3], moves[3:])
         )
+        of_pose, of_twist = np.zeros((6, 6)), np.zeros(36)
+        if covariance is not None:
+            of_pose = _turned(covariance, T_frame_base)
+        if twist_base is None and marks_twist:
+            of_twist[0] = -1.0
         return self._cdr(
             names.TYPES[names.ODOMETRY],
             header=self._header(stamp_ns, frame),
-            child_frame_id=names.BASE,
+            child_frame_id=base,
             pose=self._new(
                 "geometry_msgs/msg/PoseWithCovariance",
                 pose=self._pose(T_frame_base),
-                covariance=np.zeros(36),
+                covariance=of_pose.ravel(),
             ),
             twist=self._new(
                 "geometry_msgs/msg/TwistWithCovariance",
                 twist=self._new("geometry_msgs/msg/Twist", linear=linear, angular=angular),
-                covariance=np.zeros(36),
+                covariance=of_twist,
             ),
         )
 
@@ -233,3 +244,22 @@ class Encoder:
 
     def _cdr(self, msgtype: str, **fields: Any) -> bytes:
         return bytes(self._store.serialize_cdr(self._new(msgtype, **fields), msgtype))
+
+
+def sensor_frames(rig: Rig) -> dict[str, Transform]:
+    """Return the poses T_base_sensor (4, 4) [m] of the rig's sensors by their frames."""
+    frames: dict[str, Transform] = {}
+    if rig.camera:
+        frames[names.CAMERA] = rig.camera.T_base_cam
+    if rig.laser:
+        frames[names.LASER] = rig.laser.T_base_laser
+    if rig.lidar:
+        frames[names.LIDAR] = rig.lidar.T_base_lidar
+    return frames
+
+
+def _turned(covariance: NDArray[np.float64], T_frame_base: Transform) -> NDArray[np.float64]:
+    """Return a covariance (6, 6) in base, translation first, along the axes of the frame."""
+    turn = np.zeros((6, 6))
+    turn[:3, :3] = turn[3:, 3:] = T_frame_base[:3, :3]
+    return np.asarray(turn @ covariance @ turn.T)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sceneslam.ros.encode import Encoder
 from sceneslam.types import se3
@@ -19,40 +18,6 @@ _COUNT, _CDR_HEADER = np.dtype("<u4"), 4  # bytes before the first field, from w
 
 class ResultEncoder(Encoder):
     """Builds and serialises messages of results."""
-
-    def pose_odometry(
-        self,
-        stamp_ns: int,
-        T_frame_base: Transform,
-        covariance: NDArray[np.float64] | None,
-        *,
-        frame: str,
-        base: str,
-    ) -> bytes:
-        """Return an Odometry of T_frame_base (4, 4) [m]; its covariance (6, 6) [m, rad] is in base.
-
-        The covariance is rotated to the axes of `frame`, as the message defines. Velocity is not
-        estimated: the first entry of its covariance is -1.
-        """
-        zero = self._new("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
-        unknown = np.zeros(36)
-        unknown[0] = -1.0
-        known = np.zeros((6, 6)) if covariance is None else _turned(covariance, T_frame_base)
-        return self._cdr(
-            "nav_msgs/msg/Odometry",
-            header=self._header(stamp_ns, frame),
-            child_frame_id=base,
-            pose=self._new(
-                "geometry_msgs/msg/PoseWithCovariance",
-                pose=self._pose(T_frame_base),
-                covariance=known.ravel(),
-            ),
-            twist=self._new(
-                "geometry_msgs/msg/TwistWithCovariance",
-                twist=self._new("geometry_msgs/msg/Twist", linear=zero, angular=zero),
-                covariance=unknown,
-            ),
-        )
 
     def path(
         self, stamps_ns: Sequence[int], T_frame_base: Sequence[Transform], frame: str
@@ -118,13 +83,6 @@ class ResultEncoder(Encoder):
             header=self._header(stamp_ns, ""),
             status=[status],
         )
-
-
-def _turned(covariance: NDArray[np.float64], T_frame_base: Transform) -> NDArray[np.float64]:
-    """Return a covariance (6, 6) in base, translation first, along the axes of the frame."""
-    turn = np.zeros((6, 6))
-    turn[:3, :3] = turn[3:, 3:] = T_frame_base[:3, :3]
-    return np.asarray(turn @ covariance @ turn.T)
 
 
 def _poses(

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
+
+# Between the files of a definition in IDL, as MCAP joins them (its format registry, "ros2idl").
+_IDL_HEAD = re.compile(r"^=+\s*\nIDL: .*$", re.MULTILINE)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,7 +71,9 @@ def _typestore(kind: TopicType) -> Any:
     store = get_typestore(Stores.EMPTY)
     try:
         if kind.definition_format == "ros2idl":
-            store.register(get_types_from_idl(kind.definition))
+            for text in _IDL_HEAD.split(kind.definition):
+                if text.strip():
+                    store.register(get_types_from_idl(text))
         else:
             # Bags from before 2011 have the header in a package that no longer exists.
             text = kind.definition.replace("roslib/Header", "std_msgs/Header")

@@ -1,4 +1,4 @@
-"""Decoding of images and depth images."""
+"""Decoding of images and depth images, and how images are written."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from typing import Any, TypeVar
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from sceneslam.types.errors import ConfigError
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 
@@ -34,6 +36,18 @@ def decode_bgr(data: bytes) -> NDArray[np.uint8] | None:
     """Return the image (H, W, 3) uint8 BGR of a file's bytes, None if it is damaged."""
     pixels = decode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     return None if pixels is None else locked(pixels)
+
+
+def image_options(image_format: str, jpeg_quality: int) -> list[int]:
+    """Return OpenCV's options for images to be written, jpeg or png.
+
+    Raises ConfigError if the format is another one or the quality not 1 to 100.
+    """
+    if image_format not in ("jpeg", "png"):
+        raise ConfigError("image_format", image_format, "jpeg or png")
+    if not 1 <= jpeg_quality <= 100:
+        raise ConfigError("jpeg_quality", jpeg_quality, "1 to 100")
+    return [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality] if image_format == "jpeg" else []
 
 
 def locked(array: NDArray[Scalar]) -> NDArray[Scalar]:

@@ -11,9 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.ros import names
+from sceneslam.ros.encode import sensor_frames
 from sceneslam.ros.encode_results import ResultEncoder
+from sceneslam.ros.pixels import image_options
 from sceneslam.types import se3
-from sceneslam.types.errors import ConfigError, InputError
+from sceneslam.types.errors import InputError
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.run import RunResult
@@ -35,13 +37,9 @@ class ObservationWriter:
     def __init__(self, path: Path, *, rig: Rig, image_format: str, jpeg_quality: int = 95) -> None:
         from mcap.writer import CompressionType, Writer
 
-        if image_format not in ("jpeg", "png"):
-            raise ConfigError("image_format", image_format, "jpeg or png")
-        if not 1 <= jpeg_quality <= 100:
-            raise ConfigError("jpeg_quality", jpeg_quality, "1 to 100")
         self._rig = rig
         self._image_format = image_format
-        self._jpeg_quality = jpeg_quality
+        self._image_options = image_options(image_format, jpeg_quality)
         self._encoder = ResultEncoder()
         self._posed: tuple[int, Transform] | None = None
         self._first_pose: tuple[int, Transform] | None = None
@@ -92,7 +90,7 @@ class ObservationWriter:
         before, self._posed = self._posed, (stamp_ns, T_map_base)
         self._first_pose = self._first_pose or self._posed
         twist_base = None if before is None else _twist(*before, stamp_ns, T_map_base)
-        data = self._encoder.odometry(stamp_ns, T_map_base, names.MAP, twist_base)
+        data = self._encoder.odometry(stamp_ns, T_map_base, names.MAP, twist_base=twist_base)
         self._add(names.RESULT_ODOMETRY, stamp_ns, data)
         data = self._encoder.transforms(stamp_ns, names.MAP, {names.BASE: T_map_base})
         self._add(names.TF, stamp_ns, data)
@@ -133,16 +131,6 @@ class ObservationWriter:
         for change in truth.scenes:
             self._add(names.TRUTH_SCENE, change.stamp_ns, self._encoder.text(change.scene))
 
-    def attach(self, name: str, text: str) -> None:
-        """Add a named text (a configuration, say) as an attachment."""
-        self._mcap.add_attachment(
-            create_time=0,
-            log_time=self._last_ns,
-            name=name,
-            media_type="text/plain",
-            data=text.encode(),
-        )
-
     def close(self) -> None:
         """Close the file; a second call does nothing."""
         if not self._is_open:
@@ -152,10 +140,7 @@ class ObservationWriter:
         self._file.close()
 
     def _write_image(self, stamp_ns: int, image_bgr: NDArray[np.uint8]) -> None:
-        options = [cv2.IMWRITE_JPEG_QUALITY, self._jpeg_quality]
-        done, data = cv2.imencode(
-            f".{self._image_format}", image_bgr, options if self._image_format == "jpeg" else []
-        )
+        done, data = cv2.imencode(f".{self._image_format}", image_bgr, self._image_options)
         if not done:
             raise InputError(f"image at {stamp_ns} ns: could not be written: {image_bgr.shape}")
         encoding = f"bgr8; {self._image_format} compressed bgr8"
@@ -167,14 +152,7 @@ class ObservationWriter:
         if self._has_frames:
             return
         self._has_frames = True
-        rig = self._rig
-        frames: dict[str, Transform] = {}
-        if rig.camera:
-            frames[names.CAMERA] = rig.camera.T_base_cam
-        if rig.laser:
-            frames[names.LASER] = rig.laser.T_base_laser
-        if rig.lidar:
-            frames[names.LIDAR] = rig.lidar.T_base_lidar
+        frames = sensor_frames(self._rig)
         if frames:
             data = self._encoder.transforms(stamp_ns, names.BASE, frames)
             self._add(names.TF_STATIC, stamp_ns, data)

@@ -12,6 +12,8 @@ import numpy as np
 
 from sceneslam.interfaces import LiveMapper
 from sceneslam.ros import names
+from sceneslam.ros.encode import sensor_frames
+from sceneslam.ros.pixels import image_options
 from sceneslam.ros.transport.transport import Qos, Transport
 from sceneslam.sinks.ros2 import requests
 from sceneslam.sinks.ros2.topics import TopicSink
@@ -59,9 +61,8 @@ class FoxgloveSink(TopicSink):
             raise ConfigError("port", port, "1024 to 65535, or 0: any that is free")
         if image_every < 1:
             raise ConfigError("image_every", image_every, "1 or more")
-        if not 1 <= jpeg_quality <= 100:
-            raise ConfigError("jpeg_quality", jpeg_quality, "1 to 100")
-        self._port, self._image_every, self._jpeg_quality = port, image_every, jpeg_quality
+        self._port, self._image_every = port, image_every
+        self._jpeg = image_options("jpeg", jpeg_quality)
         super().__init__(
             self._serve,
             map_frame=names.MAP,
@@ -111,7 +112,7 @@ class FoxgloveSink(TopicSink):
         served = FoxgloveTransport(self._port, PARAMETERS)
         for topic, (msgtype, qos) in _SENSORS.items():
             served.publisher(topic, msgtype, qos)
-        frames = self._frames()
+        frames = sensor_frames(self._rig)
         if frames:
             cdr = self.encoder.transforms(0, names.BASE, frames)
             served.publisher(names.TF_STATIC, *_SENSORS[names.TF_STATIC]).publish(cdr)
@@ -120,21 +121,11 @@ class FoxgloveSink(TopicSink):
         )
         return served
 
-    def _frames(self) -> dict[str, Transform]:
-        rig = self._rig
-        frames = {}
-        if rig.camera:
-            frames[names.CAMERA] = rig.camera.T_base_cam
-        if rig.laser:
-            frames[names.LASER] = rig.laser.T_base_laser
-        return frames
-
     def _show_image(self, stamp_ns: int, image_bgr: np.ndarray) -> None:
         self._images += 1
         if self._images % self._image_every != 0:
             return
-        quality = [cv2.IMWRITE_JPEG_QUALITY, self._jpeg_quality]
-        done, data = cv2.imencode(".jpeg", image_bgr, quality)
+        done, data = cv2.imencode(".jpeg", image_bgr, self._jpeg)
         if done:
             jpeg = np.asarray(data, np.uint8)
             self._show(names.IMAGE, self.encoder.compressed_image(stamp_ns, "jpeg", jpeg))

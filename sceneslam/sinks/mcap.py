@@ -7,6 +7,7 @@ import logging
 from dataclasses import replace
 from pathlib import Path
 
+from sceneslam.ros.pixels import image_options
 from sceneslam.ros.writer import ObservationWriter
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.files import finish, part_of
@@ -29,10 +30,7 @@ class McapSink:
     def __init__(
         self, path: str, image_format: str, jpeg_quality: int, image_every: int, depth_every: int
     ) -> None:
-        if image_format not in ("jpeg", "png"):
-            raise ConfigError("image_format", image_format, "jpeg or png")
-        if not 1 <= jpeg_quality <= 100:
-            raise ConfigError("jpeg_quality", jpeg_quality, "1 to 100")
+        image_options(image_format, jpeg_quality)  # refused before the run
         for key, every in (("image_every", image_every), ("depth_every", depth_every)):
             if every < 1:
                 raise ConfigError(key, every, "a whole number of observations from 1")

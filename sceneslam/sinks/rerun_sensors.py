@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
+from sceneslam.ros.pixels import image_options
+from sceneslam.ros.writer import depth_png
 from sceneslam.sinks import rerun_layout as at
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
@@ -26,9 +28,8 @@ class SensorLog:
         for name, count in every.items():
             if count < 1:
                 raise ConfigError(f"{name}_every", count, "a whole number of observations from 1")
-        if not 1 <= jpeg_quality <= 100:
-            raise ConfigError("jpeg_quality", jpeg_quality, "1 to 100")
-        self._every, self._jpeg_quality, self._count = every, jpeg_quality, 0
+        self._every, self._jpeg = every, image_options("jpeg", jpeg_quality)
+        self._count = 0
 
     def place(self, recording: rr.RecordingStream, rig: Rig) -> None:
         """Log the poses of the sensors on the robot."""
@@ -49,14 +50,12 @@ class SensorLog:
         import rerun as rr
 
         if observation.image_bgr is not None and self._is_due("image"):
-            quality = [cv2.IMWRITE_JPEG_QUALITY, self._jpeg_quality]
-            _, jpeg = cv2.imencode(".jpg", observation.image_bgr, quality)
+            _, jpeg = cv2.imencode(".jpg", observation.image_bgr, self._jpeg)
             image = rr.EncodedImage(contents=jpeg.tobytes(), media_type="image/jpeg")
             recording.log(f"{at.CAMERA}/image", image)
         if observation.depth_m is not None and self._is_due("depth"):
-            depth_mm = np.clip(observation.depth_m * 1000.0, 0, 65535).astype(np.uint16)
-            _, png = cv2.imencode(".png", depth_mm)
-            depth = rr.EncodedDepthImage(png.tobytes(), media_type="image/png", meter=1000.0)
+            png = depth_png(observation.depth_m).tobytes()
+            depth = rr.EncodedDepthImage(png, media_type="image/png", meter=1000.0)
             recording.log(f"{at.CAMERA}/depth", depth)
         if observation.scan is not None and self._is_due("scan"):
             recording.log(f"{at.LASER}/scan", _cloud(observation.scan))

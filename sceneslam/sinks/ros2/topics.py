@@ -118,8 +118,13 @@ class TopicSink:
             self._place(T_map_base)
             T_frame_base = self._T_frame_map @ T_map_base
             self._send_transform(stamp_ns, T_frame_base, observation.T_odom_base)
-            odometry = self.encoder.pose_odometry(
-                stamp_ns, T_frame_base, covariance, frame=self._map_frame, base=self._base_frame
+            odometry = self.encoder.odometry(
+                stamp_ns,
+                T_frame_base,
+                self._map_frame,
+                base=self._base_frame,
+                covariance=covariance,
+                marks_twist=True,
             )
             self.send(ODOMETRY, odometry)
             self._keep(stamp_ns, T_map_base)

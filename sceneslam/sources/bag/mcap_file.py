@@ -86,6 +86,8 @@ class McapFile:
         summary = reader.get_summary()
         if summary is None or summary.statistics is None or not summary.chunk_indexes:
             return None
+        if not summary.statistics.channel_message_counts:  # a writer need not count by channel
+            return None
         metadata = {entry.name: dict(entry.metadata) for entry in reader.iter_metadata()}
         content = records.Content(
             schemas=summary.schemas,

@@ -70,14 +70,6 @@ class FolderRecording:
         self.topics = self._read_topics()
         self._decoder = MessageDecoder(self.topics)
 
-    @property
-    def span_ns(self) -> tuple[int, int]:
-        """Return the first and last log time."""
-        from rosbags.rosbag2 import Reader
-
-        with self._guarded(), Reader(self._path) as reader:
-            return int(reader.start_time), int(reader.end_time)
-
     def messages(self, topics: Collection[str], from_ns: int | None = None) -> Iterator[Message]:
         """Yield the messages of `topics` by log time."""
         from rosbags.rosbag2 import Reader

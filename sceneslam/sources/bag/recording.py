@@ -45,11 +45,6 @@ class Recording(Protocol):
         """Return the metadata that was recorded beside the messages."""
         ...
 
-    @property
-    def span_ns(self) -> tuple[int, int]:
-        """Return the recording times [ns] of the first and the last message."""
-        ...
-
     def messages(self, topics: Collection[str], from_ns: int | None = None) -> Iterator[Message]:
         """Yield the messages of `topics` by recording time, from `from_ns` or the beginning on."""
         ...
@@ -146,12 +141,6 @@ class ChunkedRecording:
             amount = f"{_amount(lost)} of {_amount(size)})" if size else _amount(lost)
             notes.append(f"{share}{amount} is damaged and could not be read")
         return ["; ".join(notes)] if notes else []
-
-    @property
-    def span_ns(self) -> tuple[int, int]:
-        """Return the first and last recording time [ns] of the index."""
-        starts = (chunk.start_ns for chunk in self._chunks)
-        return min(starts, default=0), max((chunk.end_ns for chunk in self._chunks), default=0)
 
     def messages(self, topics: Collection[str], from_ns: int | None = None) -> Iterator[Message]:
         """Yield the messages by recording time; only overlapping chunks are in memory."""

@@ -42,12 +42,6 @@ class LiveRecording:
         self._changed = threading.Lock()
         self._decoder = MessageDecoder(self.topics)
 
-    @property
-    def span_ns(self) -> tuple[int, int]:
-        """Return the arrival times [ns] of the first and last message (monotonic clock)."""
-        times = [one.log_ns for held in self._copies() for one in (held[0], held[-1])]
-        return min(times, default=0), max(times, default=0)
-
     def listen(
         self,
         transport: Transport,
