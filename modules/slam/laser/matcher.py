@@ -213,20 +213,19 @@ class Matcher:
         levels = list(zip(_KERNELS_M, _ITERATIONS, strict=True))
         for kernel_m, iterations in levels[-1:] if is_near else levels:
             for _ in range(iterations):
-                H, g, _ = self._laser_equations(scan_base, field, pose, kernel_m, shift_m)
+                pairs = _Pairs.of(scan_base, field, pose)
+                H, g, _ = self._laser_equations(scan_base, pairs, kernel_m, [shift_m])[0]
                 prior = expected.weighed(pose)
                 step = -np.linalg.solve(H + prior, g + prior @ expected.off(pose))
                 pose = pose + step
                 pose[2] = wrap(pose[2])
                 if np.all(np.abs(step) < _CONVERGED):
                     break
-        H, _, weak = self._laser_equations(scan_base, field, pose, _KERNELS_M[-1], shift_m)
-        alone = H
-        if shift_m != self.shift_m:
-            alone, _, _ = self._laser_equations(
-                scan_base, field, pose, _KERNELS_M[-1], self.shift_m
-            )
-        residual, far, evident = _residuals(scan_base, field, pose, self.noise.ratio)
+        pairs = _Pairs.of(scan_base, field, pose)
+        (H, _, weak), (alone, _, _) = self._laser_equations(
+            scan_base, pairs, _KERNELS_M[-1], [shift_m, self.shift_m]
+        )
+        residual, far, evident = _residuals(scan_base, field, pairs, pose, self.noise.ratio)
         inlier = residual < _INLIER_M
         count = max(len(scan_base), 1)
         prior, off = expected.weighed(pose), expected.off(pose)
@@ -252,13 +251,14 @@ class Matcher:
     def _laser_equations(
         self,
         scan_base: SurfacePoints,
-        field: LikelihoodField,
-        pose: Planar,
+        pairs: _Pairs,
         kernel_m: float,
-        shift_m: float,
-    ) -> tuple[Matrix, Planar, int]:
-        """Return the normal equations H, g in (x, y, yaw), and the number of weak directions."""
-        pairs = _Pairs.of(scan_base, field, pose)
+        shifts_m: Sequence[float],
+    ) -> list[tuple[Matrix, Planar, int]]:
+        """Return the normal equations H, g in (x, y, yaw), and the number of weak directions.
+
+        For each of the standard deviations of the scan's common error.
+        """
         arms, (ex, ey), (ax, ay) = pairs.arms, pairs.error.T, pairs.across.T
         xx, xy, yy = pairs.shape.T
         robust = (kernel_m**2 / (kernel_m**2 + ax * ex + ay * ey)) ** 2
@@ -276,14 +276,16 @@ class Matcher:
         spread_m = float(np.sqrt(weight @ (lx * lx + ly * ly) / max(total, 1e-12)))
         spread_m = max(spread_m, 1e-3)
         H, g, weak = self._keep_held(H, g, total, spread_m)
-        if shift_m > 0:  # (H^-1 + C)^-1 in constrained directions, for a common error C
-            C = shift_m**2 * np.diag([1.0, 1.0, spread_m**-2])
-            damping = np.linalg.inv(np.eye(3) + H @ C)
-            H, g = damping @ H, damping @ g
         # From turning about the points' centre to turning about base.
         M = np.eye(3)
         M[:2, 2] = -centre[1], centre[0]
-        return M.T @ H @ M, M.T @ g, weak
+        found = []
+        for shift_m in shifts_m:
+            # (H^-1 + C)^-1 in constrained directions, for a common error C
+            C = shift_m**2 * np.diag([1.0, 1.0, spread_m**-2])
+            damping = np.linalg.inv(np.eye(3) + H @ C)
+            found.append((M.T @ (damping @ H) @ M, M.T @ (damping @ g), weak))
+        return found
 
     def _keep_held(
         self, H: Matrix, g: Planar, total: float, spread_m: float
@@ -347,7 +349,7 @@ class _Pairs:
 
 
 def _residuals(
-    scan_base: SurfacePoints, field: LikelihoodField, pose: Planar, noise: float
+    scan_base: SurfacePoints, field: LikelihoodField, pairs: _Pairs, pose: Planar, noise: float
 ) -> tuple[Planar, Planar, Planar]:
     """Return the points' distances [m] as inliers, to the nearest point, and as evidence.
 
@@ -356,7 +358,6 @@ def _residuals(
     that nothing saw before, is as likely as one at its surface, by the `noise` relative to the
     expected one.
     """
-    pairs = _Pairs.of(scan_base, field, pose)
     across = np.sqrt(np.maximum((pairs.across * pairs.error).sum(axis=1), 0.0))
     far = np.linalg.norm(pairs.error, axis=1)
     unknown = pairs.shape[:, 0] + pairs.shape[:, 2] == 0
