@@ -149,6 +149,18 @@ def test_a_submap_ends_after_its_length_its_turn_and_its_session():
     assert third.stamps_ns[0] == 11 * S
 
 
+def test_a_climb_is_as_long_as_a_way_ahead():
+    def up(z_m):
+        T = se3.identity()
+        T[2, 3] = z_m
+        return T
+
+    climbs = [key_pose(index, up(0.25 * index)) for index in range(25)]
+    assert [len(part) for part in split(climbs)] == [11, 11, 3]
+    ahead = [key_pose(index, at(0.25 * index)) for index in range(25)]
+    np.testing.assert_allclose(motion_covariance(climbs), motion_covariance(ahead))
+
+
 def run_of(count, *, module=lambda i: "a", session=lambda i: 0, step_s=1):
     """Return a collector after so many steps of 0.5 m, one a second."""
 

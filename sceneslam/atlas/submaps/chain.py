@@ -119,5 +119,8 @@ class Chain:
 
 
 def is_guessed(covariance: NDArray[np.float64]) -> bool:
-    """Tell whether a motion with this covariance (6, 6) is hardly known."""
-    return bool(covariance[0, 0] > _GUESSED_M**2)
+    """Tell whether a motion with this covariance (6, 6) is hardly known.
+
+    In more than one direction, as one may be open along a corridor.
+    """
+    return bool(np.linalg.eigvalsh(covariance[:3, :3])[1] > _GUESSED_M**2)

@@ -118,9 +118,9 @@ class OpenSubmap:
         if self.poses:
             if self.poses[-1].session != pose.session:
                 return False
-            step = _planar(self.poses[-1], pose)
-            self._length_m += float(np.hypot(step[0], step[1]))
-            self._turn_rad += abs(float(step[2]))
+            length_m, turned_rad = _moved([self.poses[-1], pose])[0]
+            self._length_m += length_m
+            self._turn_rad += turned_rad
             if self._length_m > LENGTH_M or self._turn_rad > TURN_RAD:
                 return False
         self.poses.append(pose)
@@ -133,8 +133,7 @@ def motion_covariance(poses: Sequence[KeyPose]) -> Covariance:
     Errors of one kind are systematic: standard deviations add up. The error of a map's rotation is
     random: variances add up.
     """
-    motions = np.array([_planar(a, b) for a, b in pairwise(poses)]).reshape(-1, 3)
-    along_m, turned = np.hypot(motions[:, 0], motions[:, 1]), np.abs(motions[:, 2])
+    along_m, turned = _moved(poses).T
     kinds = [pose.drift for pose in poses[1:]]
     per_m = np.array([kind.per_m for kind in kinds])
     rad_per_m = np.array([kind.rad_per_m for kind in kinds])
@@ -142,8 +141,7 @@ def motion_covariance(poses: Sequence[KeyPose]) -> Covariance:
     rad_per_root = np.array([kind.rad_per_root for kind in kinds])
     turn = float(rad_per_m @ along_m + rad_per_rad @ turned)
     turn = float(np.hypot(turn, np.sqrt(rad_per_root**2 @ (along_m + turned))))
-    away = _planar(poses[0], poses[-1])
-    lever_m = 0.5 * float(np.hypot(away[0], away[1]))
+    lever_m = 0.5 * float(_moved([poses[0], poses[-1]])[0, 0])
     shift_m = float(np.hypot(per_m @ along_m, turn * lever_m))
     variances = np.repeat([shift_m**2, turn**2], 3) + LEAST**2
     return np.diag(variances) + _grown(poses)
@@ -162,6 +160,13 @@ def _grown(poses: Sequence[KeyPose]) -> Covariance:
         growth = growth + grown(first.reported, last.reported, T_last_first)
     carried = se3.carried(growth, se3.inverse(end.T_map_base) @ last.T_map_base)
     return carried if last is end else carried + end.of_map
+
+
+def _moved(poses: Sequence[KeyPose]) -> NDArray[np.float64]:
+    """Return the length and the angle (K - 1, 2) [m, rad] of the motions between K poses."""
+    steps = [se3.inverse(a.T_map_base) @ b.T_map_base for a, b in pairwise(poses)]
+    T = np.array(steps).reshape(-1, 4, 4)
+    return np.column_stack([np.linalg.norm(T[:, :3, 3], axis=1), se3.rotation_angle_rad(T)])
 
 
 def _planar(first: KeyPose, second: KeyPose) -> Planar:
