@@ -19,8 +19,9 @@ _LEVEL_COS = np.cos(np.radians(5.0))  # lasers with more tilt measure floor and 
 _BEAMS = 360  # of a lidar's revolution
 _DEPTH_BEAMS, _STRIDE_PX = 160, 4  # a beam is one cell wide at the largest range
 _REACH = 3  # neighbours to either side for the fit of a line
-_SHORTEST_M, _LONGEST_M = 0.03, 0.6  # distance from the first to the last neighbour
-_FLAT_RATIO, _FLAT_M = 0.1, 0.02  # largest distance of a neighbour to the line: range noise
+_SHORTEST_M, _LONGEST_M = 0.03, 1.5  # from the first neighbour to the last: a degree at 14 m
+_FLAT_RATIO = 0.1  # largest distance of a neighbour to the line, of its length ...
+_FLAT_M = (0.02, 0.06)  # ... but within range noise
 _FAR_M = 15.0  # beyond, beams of a degree are five cells apart
 
 
@@ -102,6 +103,6 @@ def line_normals(scan: KeyScan) -> NDArray[np.float64]:
         spread_m = np.maximum(spread_m, np.abs(((between - before) * normal).sum(axis=1)))
     towards = np.sign(((origin - points[inner]) * normal).sum(axis=1))
     is_line = (length_m > _SHORTEST_M) & (length_m < _LONGEST_M)
-    is_line &= spread_m < np.maximum(_FLAT_RATIO * length_m, _FLAT_M)
+    is_line &= spread_m < np.clip(_FLAT_RATIO * length_m, *_FLAT_M)
     normals[inner] = normal * (towards * is_line)[:, None]
     return normals

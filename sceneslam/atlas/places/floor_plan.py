@@ -72,17 +72,19 @@ def draw(scans: Sequence[tuple[Planar, KeyScan]]) -> FloorPlan:
     starts = [planar.apply(T, scan.origin[None])[0] for T, scan in scans]
     everything = np.concatenate([*ends, *(start[None] for start in starts)])
     low, (rows, columns) = _box(everything)
-    misses = np.zeros((rows, columns), np.uint16)
+    misses, hits = (np.zeros((rows, columns), np.uint16) for _ in range(2))  # scans, not beams
     for start, end in zip(starts, ends, strict=True):
         ray = np.zeros((rows, columns), np.uint8)
         _draw_rays(ray, start / CELL_M - low, end / CELL_M - low)
         misses += ray
+        cells = np.floor(end / CELL_M).astype(np.int64) - low
+        hits.reshape(-1)[np.unique(cells[:, 1] * columns + cells[:, 0])] += 1
     points = np.concatenate(ends)
     turned = [line_normals(scan) @ planar.rotation(float(T[2])).T for T, scan in scans]
-    index, hits, centres, normals = _binned(points, np.concatenate(turned), low, (rows, columns))
+    index, count, centres, normals = _binned(points, np.concatenate(turned), low, (rows, columns))
     least = 1 if len(scans) < 3 else 2
-    passed = misses.reshape(-1)[index]
-    is_wall = (hits >= least) & (hits >= _HITS_PER_MISS * passed)
+    hit, passed = hits.reshape(-1)[index], misses.reshape(-1)[index]
+    is_wall = (count >= least) & (hit >= _HITS_PER_MISS * passed)
     free = misses >= least
     free.reshape(-1)[index] = False
     return _plan(centres[is_wall], normals[is_wall], free, low)
