@@ -6,7 +6,7 @@ import pytest
 from sceneslam.motion.model import MotionModel
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation
-from sceneslam.types.rig import Rig, Sensor, Wheels
+from sceneslam.types.rig import Gyro, Rig, Sensor, Wheels
 
 PERIOD_S = 0.1
 SCAN = np.diag([0.004, 0.004, 1e-4, 1e-4, 1e-4, 0.002]) ** 2  # of a scan's motion
@@ -220,6 +220,24 @@ def test_gyro_turns_the_base_without_its_bias():
     assert drive.model.turns.gyro_bias == pytest.approx([0.01] * 3, abs=0.001)
     drive.step(speed=0.0, rate=0.0, gyro=constant_rate(0.5, 0.01), teaches=False)  # wheels slip
     assert se3.yaw_rad(drive.last.T_prev_curr) == pytest.approx(0.05, abs=2e-4)
+
+
+@pytest.mark.parametrize("parts", [1, 20])
+def test_what_is_left_of_a_gyros_bias_adds_up_until_a_motion_is_measured(parts):
+    model, turned_rad2, period_s = MotionModel(FREE), 0.0, 1.0 / parts
+    bias_radps, noise_rad2 = model.turns.gyro_bias_deviation, Gyro().noise_rad ** 2
+    times_s = np.linspace(-0.99 * period_s, 0.0, 100)
+    for part in range(parts + 1):
+        gyro = np.column_stack([times_s, np.zeros((100, 3))])
+        stamp_ns = round(part * period_s * 1e9)
+        motion = model.predict(Observation(stamp_ns=stamp_ns, gyro_base=gyro))
+        turned_rad2 += motion.covariance[5, 5]
+    assert turned_rad2 == pytest.approx(bias_radps**2 + parts * noise_rad2)
+    model.learn(se3.identity(), SCAN)
+    after = model.predict(Observation(stamp_ns=round((1.0 + period_s) * 1e9), gyro_base=gyro))
+    left_radps = model.turns.gyro_bias_deviation
+    expected = (left_radps * period_s) ** 2 + noise_rad2
+    assert after.covariance[5, 5] == pytest.approx(expected)
 
 
 def test_robot_that_is_carried_does_not_teach_the_gyro_a_bias():

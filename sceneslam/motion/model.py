@@ -89,8 +89,10 @@ class MotionModel:
         turn = self.turns.by_gyro(observation, duration_s)
         self.is_turn_measured = turn is not None
         if turn is not None:
-            noise_rad = self.turns.gyro_bias_deviation * duration_s + self._gyro.noise_rad
-            guess = guess.turned(turn, noise_rad, duration_s)
+            # What is left of the bias is the same in all steps since a measured motion.
+            biased_s2 = (self._since_s + duration_s) ** 2 - self._since_s**2
+            variance = self.turns.gyro_bias_deviation**2 * biased_s2 + self._gyro.noise_rad**2
+            guess = guess.turned(turn, variance, duration_s)
             if wheels is not None and gap is None:
                 self.turns.compare(
                     turn,
@@ -99,7 +101,7 @@ class MotionModel:
                     variance=float(wheels.variance[1]),
                     duration_s=duration_s,
                 )
-                wheels = wheels.turned(turn, noise_rad, duration_s)
+                wheels = wheels.turned(turn, variance, duration_s)
         if self._is_weighed and wheels is not None and gap is None:
             self._judge(self.inertia.evidence(wheels, guess, duration_s))
         self._since_s += duration_s

@@ -38,11 +38,11 @@ class Step:
             causes=self.causes + step.causes,
         )
 
-    def turned(self, turn: NDArray[np.float64], noise_rad: float, duration_s: float) -> Step:
-        """Return the step with its turn replaced by the gyro's rotation vector (3,) [rad]."""
+    def turned(self, turn: NDArray[np.float64], variance: float, duration_s: float) -> Step:
+        """Return the step with the gyro's rotation vector (3,) [rad] and its variance [rad^2]."""
         return Step(
             T=se3.from_parts(se3.so3_exp(turn), self.T[:3, 3]),
-            variance=np.array([self.variance[0], noise_rad**2]),
+            variance=np.array([self.variance[0], variance]),
             amounts=np.array([self.amounts[0], 0.0]),
             causes=np.array([0.0, 0.0, duration_s]),
         )
