@@ -25,6 +25,7 @@ _VIEWS = 12  # the last ones, of 0.3 m or a turn each
 _KEPT = 80  # views that are remembered: a hand-over replaces the poses of 20 s
 _STEPS = 1000  # the same, in images
 _JUMP_M_S = 1.0  # no robot's velocity changes so much from one image to the next: its path jumped
+_JUMP_S = 1 / 30  # the same, if images come more often: a pose's noise is no jump
 _PATH_M, _PATH_RAD = 0.01, 0.003  # standard deviations of the motion between two views
 _OFF_PX = 1.5  # from where the other view's ray meets this one's, at most
 _DEVIATION_RATIO = 0.4  # of a depth, at most: from beside where it was seen, it counts for less
@@ -78,8 +79,10 @@ class Triangulation:
         if self._steps:
             last = self._steps[-1]
             moved_m = float(np.linalg.norm(T_run_base[:3, 3] - last.T_run_base[:3, 3]))
-            speed_m_s = moved_m * 1e9 / (stamp_ns - last.stamp_ns)
-            if abs(speed_m_s - last.speed_m_s) <= _JUMP_M_S:
+            duration_s = (stamp_ns - last.stamp_ns) * 1e-9
+            speed_m_s = moved_m / duration_s
+            off_m = abs(moved_m - last.speed_m_s * duration_s)
+            if off_m <= _JUMP_M_S * max(duration_s, _JUMP_S):
                 began_ns = last.began_ns
         self._steps.append(
             _Step(stamp_ns=stamp_ns, T_run_base=T_run_base, speed_m_s=speed_m_s, began_ns=began_ns)
