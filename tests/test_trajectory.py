@@ -41,6 +41,7 @@ def test_stamps_in_powers_of_ten_keep_their_nanoseconds(tmp_path):
         "1.0 nan 0 0 0 0 0 1",
         "1403636579763555584 1 2 3 0 0 0 1",  # nanoseconds
         "1e400 1 2 3 0 0 0 1",
+        "1.0,0.5,1.0,0.5,1.0,0.1,0.2,0.3,0.4",  # a CSV of another layout
     ],
 )
 def test_bad_line_is_named(tmp_path, line):

@@ -54,7 +54,7 @@ class Trajectory:
                 continue
             try:
                 stamps_ns.append(parse_stamp_ns(words[0]))
-                rows.append([float(word) for word in words[1:8]])
+                rows.append([float(word) for word in words[1:]])
             except ValueError:
                 rows.append([])
             if not _is_pose(rows[-1]):
