@@ -9,8 +9,8 @@ from sceneslam.types.trajectory import Trajectory
 
 
 def test_tum_file_keeps_nanoseconds_and_poses(tmp_path):
-    stamps_ns = np.array([1305031229528748001, 1305031229564425999])
-    poses = np.stack([se3.from_xy_yaw(1, 2, 0.3), se3.exp(np.array([1, 2, 3, 0.1, 3.0, 0.2]))])
+    stamps_ns = np.array([-1500000000, -500000000, 1305031229528748001, 1305031229564425999])
+    poses = np.stack([se3.exp(k * np.array([1, 2, 3, 0.1, 3.0, 0.2])) for k in range(4)])
     Trajectory(stamps_ns=stamps_ns, T_world_base=poses).write_tum(tmp_path / "t.tum")
     back = Trajectory.read_tum(tmp_path / "t.tum")
     np.testing.assert_array_equal(back.stamps_ns, stamps_ns)

@@ -207,7 +207,7 @@ def test_a_run_logs_how_certain_every_session_was_where_it_began():
 
 def test_covariances_are_read_as_they_were_written(tmp_path):
     found = solved(path_of("000--111", 1e-4 * np.eye(6)))
-    stamps_ns = 10**18 + np.arange(8) * 33_333_333
+    stamps_ns = np.append([-500_000_000], 10**18 + np.arange(7) * 33_333_333)
     write_covariances(tmp_path / "covariance.txt", stamps_ns, found)
     stamps_read_ns, read = read_covariances(tmp_path / "covariance.txt")
     np.testing.assert_array_equal(stamps_read_ns, stamps_ns)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sceneslam.types.covariance import TRIANGLE, symmetric, triangle
 from sceneslam.types.files import replacing
-from sceneslam.types.trajectory import parse_stamp_ns
+from sceneslam.types.trajectory import parse_stamp_ns, stamp_text
 
 Covariance = NDArray[np.float64]  # (6, 6): T_true = T_told @ exp(xi), xi in base as se3.log has it
 
@@ -64,7 +64,7 @@ def write_covariances(
         file.write("# stamp_s xx xy xz xr xp xw yy yz yr yp yw zz zr zp zw rr rp rw pp pw ww\n")
         for stamp_ns, row in zip(stamps_ns.tolist(), rows, strict=True):
             numbers = " ".join(f"{value:.6e}" for value in row)
-            file.write(f"{stamp_ns // 10**9}.{stamp_ns % 10**9:09d} {numbers}\n")
+            file.write(f"{stamp_text(stamp_ns)} {numbers}\n")
 
 
 def read_covariances(path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:

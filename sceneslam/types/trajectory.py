@@ -83,7 +83,7 @@ class Trajectory:
                 self.stamps_ns.tolist(), self.positions_m, quats_xyzw, strict=True
             ):
                 numbers = " ".join(f"{value:.9f}" for value in (*position, *quat))
-                file.write(f"{stamp_ns // 10**9}.{stamp_ns % 10**9:09d} {numbers}\n")
+                file.write(f"{stamp_text(stamp_ns)} {numbers}\n")
 
 
 def parse_stamp_ns(text: str) -> int:
@@ -98,6 +98,12 @@ def parse_stamp_ns(text: str) -> int:
     except ArithmeticError:  # of Decimal: no number, NaN, or an exponent without end
         pass
     raise ValueError(f"expected seconds, got {text[:40]!r}")
+
+
+def stamp_text(stamp_ns: int) -> str:
+    """Return a stamp [ns] as seconds with nine decimals, which `parse_stamp_ns` reads."""
+    seconds, rest_ns = divmod(abs(stamp_ns), 10**9)
+    return f"{'-' if stamp_ns < 0 else ''}{seconds}.{rest_ns:09d}"
 
 
 def _is_pose(numbers: list[float]) -> bool:
