@@ -5,6 +5,7 @@ from contextlib import closing
 import numpy as np
 import pytest
 
+from sceneslam.evaluation.association import select
 from sceneslam.mesh.__main__ import main
 from sceneslam.mesh.mesh import Volume, views
 from sceneslam.storage.folder import RunFolder
@@ -55,6 +56,13 @@ def test_images_are_taken_a_step_apart_and_only_where_there_is_a_pose():
     late = [Observation(stamp_ns=10**12, depth_m=observations[0].depth_m)]
     empty = [Observation(stamp_ns=10**9, depth_m=np.zeros((60, 80), np.float32))]
     assert not list(views(late, trajectory, CAMERA)) and not list(views(empty, trajectory, CAMERA))
+
+
+def test_images_are_left_out_where_poses_are_missing_for_long():
+    observations, trajectory = drive(count=17, step_m=0.105)
+    poses = select(trajectory, np.r_[0:2, 4, 15:17])  # 0.3 s are interpolated, 1.1 s are not
+    x_m = [view.T_map_cam[0, 3] for view in views(observations, poses, CAMERA)]
+    np.testing.assert_allclose(x_m, trajectory.positions_m[np.r_[0:5, 15:17], 0], atol=1e-9)
 
 
 class RecordedWall:

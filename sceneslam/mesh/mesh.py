@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from sceneslam.config.build import make_source
 from sceneslam.config.check import first_line
 from sceneslam.config.component import ComponentBuilder
-from sceneslam.evaluation.association import interpolated
+from sceneslam.evaluation.association import TRUTH_GAP_S, covered, interpolated
 from sceneslam.interfaces import Live, Source
 from sceneslam.types import se3
 from sceneslam.types.errors import InputError
@@ -78,13 +78,16 @@ def write_mesh(folder: Path, voxel_m: float, allowed: Sequence[str] = ()) -> Mes
 def views(
     observations: Iterable[Observation], trajectory: Trajectory, camera: Camera
 ) -> Iterator[ColouredDepthImage]:
-    """Yield the depth images along a trajectory, one per 0.1 m or 9 degrees."""
+    """Yield the depth images along a trajectory, one per 0.1 m or 9 degrees.
+
+    Images of a time without poses, as after tracking was lost, are left out.
+    """
     last: Transform | None = None
-    first_ns, last_ns = trajectory.stamps_ns[[0, -1]]
     for one in observations:
-        if one.depth_m is None or not first_ns <= one.stamp_ns <= last_ns:
+        stamp_ns = np.array([one.stamp_ns])
+        if one.depth_m is None or not len(covered(trajectory, stamp_ns, TRUTH_GAP_S)):
             continue
-        T_map_base = interpolated(trajectory, np.array([one.stamp_ns])).T_world_base[0]
+        T_map_base = interpolated(trajectory, stamp_ns).T_world_base[0]
         if last is not None and not _is_apart(last, T_map_base):
             continue
         last = T_map_base
