@@ -9,6 +9,7 @@ import pytest
 from ros_recordings import make_source
 
 from sceneslam.interfaces import Source
+from sceneslam.sources.contract.ordered import Ordered
 from sceneslam.sources.survey.preflight import preflight
 from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.rig import Sensor, optical_to_rep103
@@ -59,6 +60,15 @@ def test_stamps_keep_their_microseconds(shared_data: Path) -> None:
     assert first.stamp_ns == 1305031229_528748_000
     assert first.depth_m.dtype == np.float32
     assert not first.depth_m.flags.writeable
+
+
+def test_images_of_an_unsorted_list_come_by_their_stamps(tmp_path: Path) -> None:
+    folder = make_folder(tmp_path / "a")
+    lines = (folder / "rgb.txt").read_text().splitlines()
+    (folder / "rgb.txt").write_text("\n".join(lines[::-1]))
+    found = list(Ordered(make(folder)))
+    assert [one.stamp_ns // 10**8 for one in found] == [1000, 1001, 1002, 1003]
+    assert all(one.has(Sensor.DEPTH) for one in found)
 
 
 def test_depth_is_metres_and_cut_to_its_range(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ class StampedFile:
 
 
 def read_list(path: Path) -> Sequence[StampedFile]:
-    """Return the files of a list in its order; `#` begins a comment.
+    """Return the files of a list, sorted by stamp; `#` begins a comment.
 
     Raises InputError if the list is missing or a line is not a stamp and a name.
     """
@@ -41,7 +41,7 @@ def read_list(path: Path) -> Sequence[StampedFile]:
                 f"line {number}: expected `stamp_s name`, got {line.strip()[:60]!r}: {path}"
             ) from err
         files.append(StampedFile(stamp_ns=stamp_ns, path=path.parent / name))
-    return files
+    return sorted(files, key=lambda file: file.stamp_ns)
 
 
 def nearest_once(
