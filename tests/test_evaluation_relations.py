@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from sceneslam.evaluation.__main__ import main
+from sceneslam.evaluation.files import read_poses
 from sceneslam.evaluation.relations import Relations, relation_errors
 from sceneslam.types import se3
 from sceneslam.types.errors import InputError
@@ -112,6 +113,16 @@ def test_command_line_prints_relation_errors(tmp_path, capsys):
         "matched",
         "total",
     }
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_files_with_a_byte_order_mark_are_read(tmp_path, encoding):
+    (tmp_path / "x.relations").write_text("0 1 0.1 0 0 0 0 0.2\n", encoding)
+    assert len(Relations.read(tmp_path / "x.relations").first_ns) == 1
+    (tmp_path / "tum.txt").write_text("0 1 2 3 0 0 0 1\n", encoding)
+    (tmp_path / "kitti.txt").write_text("1 0 0 1 0 1 0 2 0 0 1 3\n", encoding)
+    for name in ("tum.txt", "kitti.txt"):
+        assert read_poses(tmp_path / name).positions_m.tolist() == [[1.0, 2.0, 3.0]]
 
 
 @pytest.mark.parametrize(

@@ -83,7 +83,7 @@ def test_poses_of_twelve_numbers_are_truth(tmp_path: Path) -> None:
     folder = make_folder(tmp_path / "a")
     rows = np.tile(np.eye(4)[:3].ravel(), (3, 1))
     rows[:, 3] = [0, 1, 2]
-    np.savetxt(folder / "poses.txt", rows)
+    np.savetxt(folder / "poses.txt", rows, encoding="utf-8-sig")  # as Windows' editors write
     truth = make_source("kitti", folder).ground_truth().trajectory
     np.testing.assert_array_equal(truth.positions_m[:, 0], [0, 1, 2])
     np.savetxt(folder / "poses.txt", rows[:2])

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.types.errors import InputError
+from sceneslam.types.input_files import read_text
 from sceneslam.types.trajectory import Trajectory
 
 _ROTATION_TOLERANCE = 1e-3  # files print six digits or more
@@ -29,13 +30,13 @@ def read_poses(path: Path) -> Trajectory:
 
 
 def _first_line(path: Path) -> str:
-    with path.open(errors="replace") as file:
-        return next((line for line in file if line.strip() and line.lstrip()[0] != "#"), "")
+    lines = read_text(path).splitlines()
+    return next((line for line in lines if line.strip() and line.lstrip()[0] != "#"), "")
 
 
 def _read_kitti(path: Path) -> Trajectory:
     try:
-        values = np.loadtxt(path, ndmin=2)
+        values = np.loadtxt(read_text(path).splitlines(), ndmin=2)
     except ValueError as err:
         raise InputError(f"expected twelve numbers per line, {err}: {path}") from err
     if values.shape[1] != 12 or not np.isfinite(values).all():

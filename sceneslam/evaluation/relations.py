@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sceneslam.evaluation.association import nearest
 from sceneslam.types import se3
 from sceneslam.types.errors import InputError
+from sceneslam.types.input_files import read_text
 from sceneslam.types.trajectory import Trajectory
 
 _SAME_STAMP_S = 0.0005  # files have stamps with three decimals or more
@@ -32,7 +33,7 @@ class Relations:
         """
         if not path.is_file():
             raise InputError(f"relations file not found: {path}")
-        lines = path.read_text(errors="replace").splitlines()
+        lines = read_text(path).splitlines()
         rows = [_row(line, path) for line in lines if line.strip() and line.lstrip()[0] != "#"]
         if not rows:
             raise InputError(f"relations file holds no relations: {path}")

@@ -93,8 +93,9 @@ class Kitti(StampedScans):
 
         It is T_gt_lidar; with `Tr` in calib.txt it is the pose of the camera.
         """
+        text = read_text(path).splitlines()
         try:
-            rows = np.loadtxt(path, ndmin=2, dtype=np.float64)
+            rows = np.loadtxt(text, ndmin=2, dtype=np.float64)
         except ValueError as err:
             raise InputError(f"poses: expected 12 numbers per line ({err}): {path}") from err
         lines = _lines(self._files, len(rows))
@@ -107,7 +108,6 @@ class Kitti(StampedScans):
         T_gt_base[:, :3, :] = rows.reshape(-1, 3, 4)
         wrong = np.flatnonzero(se3.skew(T_gt_base) > _SKEW_MAX)
         if len(wrong):
-            text = read_text(path).splitlines()
             numbers = [n for n, line in enumerate(text, start=1) if line.partition("#")[0].strip()]
             raise InputError(f"poses: line {numbers[wrong[0]]} has no rotation: {path}")
         T_cam_lidar = _read_T_cam_lidar(path.with_name("calib.txt"))
