@@ -199,6 +199,13 @@ def test_a_missing_path_and_an_empty_folder_are_named(tmp_path: Path) -> None:
         make_source("rosbag", tmp_path)
 
 
+def test_hidden_files_in_a_folder_are_no_recordings(tmp_path: Path) -> None:
+    record(tmp_path / "bag_0.mcap")
+    (tmp_path / "._bag_0.mcap").write_bytes(b"of macOS")
+    source, found = read(tmp_path)
+    assert len(found) == COUNT and source.faults == []
+
+
 def test_a_bag_with_a_damaged_index_is_read_without_it(shared_data: Path) -> None:
     source = make_source("rosbag", shared_data / "bags" / "broken_index.bag")
     assert len(list(source)) == source.length == 360

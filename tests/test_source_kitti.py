@@ -141,6 +141,17 @@ def test_scans_of_a_drive_with_lost_ones_have_the_lines_of_their_numbers(tmp_pat
         make_source("kitti", folder)
 
 
+def test_scans_come_by_the_numbers_in_their_names(tmp_path: Path) -> None:
+    folder = make_folder(tmp_path / "a", count=0)
+    for number in range(11):
+        (folder / "velodyne" / f"{number}.bin").write_bytes((POINTS + number).tobytes())
+        (folder / "velodyne" / f"._{number}.bin").write_bytes(b"of macOS")
+    source = make_source("kitti", folder)
+    for number, one in enumerate(source):
+        np.testing.assert_array_equal(one.points_lidar, (POINTS + number)[:, :3])
+    assert source.length == 11 and source.faults == []
+
+
 def test_damaged_scans_are_passed_over_and_named(tmp_path: Path) -> None:
     folder = make_folder(tmp_path / "a")
     (folder / "velodyne" / "000001.bin").write_bytes(POINTS.tobytes()[:-3])

@@ -22,6 +22,7 @@ def folder(tmp_path):
     (tmp_path / "recorded" / "odom" / "any.txt").write_text(odometry)
     truth = "scene: cafe\nframe: base_link\nseq: 1\n" + POSE.format(1.0)
     (tmp_path / "gt" / "gt_cafe_1.txt").write_text(truth)
+    (tmp_path / "gt" / "._gt_cafe_1.txt").write_text("of macOS")
     return tmp_path
 
 

@@ -71,6 +71,23 @@ def test_stills_of_different_sizes_are_read_where_no_camera_is_given(images) -> 
         list(source)
 
 
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["0.png", "1.png", "2.png", "10.png"],
+        ["left_9.PNG", "left_010.PNG", "left_11.PNG", "right_1.PNG"],
+        ["9.5.png", "10.125.png", "10.2.png", "10.25.png"],  # seconds
+    ],
+)
+def test_images_come_by_the_numbers_in_their_names(tmp_path, names) -> None:
+    for number, name in enumerate(names):
+        cv2.imwrite(str(tmp_path / name), picture(50 * number))
+        (tmp_path / f"._{name}").write_bytes(b"of macOS")
+    source = make_source("video", tmp_path)
+    assert [one.image_bgr[0, 0, 0] for one in source] == [0, 50, 100, 150]
+    assert source.faults == []
+
+
 def test_damaged_image_is_left_out_and_reported(images) -> None:
     data = (images / "002.png").read_bytes()
     (images / "002.png").write_bytes(data[: len(data) // 2])

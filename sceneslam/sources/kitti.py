@@ -16,7 +16,7 @@ from sceneslam.sources.stamped_scans import StampedScans
 from sceneslam.sources.survey.survey import Stream, Survey, spread
 from sceneslam.types import se3
 from sceneslam.types.errors import InputError
-from sceneslam.types.input_files import given_folder, read_text
+from sceneslam.types.input_files import files_by_number, given_folder, read_text
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Lidar, Rig, Sensor
 from sceneslam.types.trajectory import Trajectory, parse_stamp_ns
@@ -121,7 +121,7 @@ class Kitti(StampedScans):
 
 def _scan_files(folder: Path) -> Sequence[Path]:
     for name in (*_FOLDERS, "."):
-        files = sorted((folder / name).glob("*.bin"))
+        files = files_by_number(folder / name, {".bin"})
         if files:
             return files
     raise InputError(f"no scans, expected velodyne/*.bin or velodyne_points/data/*.bin: {folder}")

@@ -10,15 +10,15 @@ from sceneslam.ros.pixels import locked
 from sceneslam.sources.spanned import TimeSpan
 from sceneslam.sources.survey.survey import Stream, Survey
 from sceneslam.types.errors import ConfigError, InputError
-from sceneslam.types.input_files import given_folder
+from sceneslam.types.input_files import files_by_number, given_folder
 from sceneslam.types.observation import Observation
 from sceneslam.types.recorded import RecordedTrajectory, read_recorded
 from sceneslam.types.rig import Rig, Sensor, Wheels
 from sceneslam.types.trajectory import Trajectory
 from sceneslam.types.truth import GroundTruth
 
-_ODOMETRY = "recorded/odom/*.txt"
-_TRUTH = "gt/*.txt"
+_ODOMETRY = "recorded/odom"
+_TRUTH = "gt"
 
 
 class OpenLoris:
@@ -37,7 +37,7 @@ class OpenLoris:
         self._scene, self._number = named[1], int(named[3])
         self._odometry = self._find(_ODOMETRY)
         if not len(self._odometry):
-            raise InputError(f"no wheel odometry of {sequence}, expected {_ODOMETRY}: {path}")
+            raise InputError(f"no wheel odometry of {sequence}, expected {_ODOMETRY}/*.txt: {path}")
 
     @property
     def rig(self) -> Rig:
@@ -72,7 +72,7 @@ class OpenLoris:
         """Return the stamps and poses of the odometry."""
         wheels = Stream(
             sensor=Sensor.ODOMETRY,
-            place=f"{self._scene} {_ODOMETRY}",
+            place=f"{self._scene} {_ODOMETRY}/*.txt",
             count=len(self._odometry),
             stamps_ns=self._odometry.stamps_ns,
         )
@@ -87,9 +87,9 @@ class OpenLoris:
         truth = self._find(_TRUTH)
         return GroundTruth(trajectory=truth) if len(truth) else None
 
-    def _find(self, pattern: str) -> Trajectory:
-        """Return the sequence's poses in all files that match a pattern; may be empty."""
-        for path in sorted(self._folder.glob(pattern)):
+    def _find(self, name: str) -> Trajectory:
+        """Return the sequence's poses in all text files of a folder; may be empty."""
+        for path in files_by_number(self._folder / name, {".txt"}):
             for one in read_recorded(path):
                 if (one.scene, one.sequence) == (self._scene, self._number):
                     return _checked(one, path).trajectory

@@ -19,7 +19,7 @@ from sceneslam.sources.intrinsics import checked_above_zero, given_intrinsics
 from sceneslam.sources.prefetch import prefetched
 from sceneslam.sources.spanned import TimeSpan
 from sceneslam.types.errors import ConfigError, InputError
-from sceneslam.types.input_files import check_regular, given_path
+from sceneslam.types.input_files import check_regular, files_by_number, given_path
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Camera, Rig, Sensor
 from sceneslam.types.truth import GroundTruth, SceneChange
@@ -49,10 +49,11 @@ class _Footage(Protocol):
 
 
 class Video:
-    """Gives one observation per frame of a video, or per image of a folder by name.
+    """Gives one observation per frame of a video, or per image of a folder.
 
-    Stamps begin at 0; they are the video's own, or equidistant if `rate_hz` is given. `camera` (fx,
-    fy, cx, cy, distortion) may be null for detectors; with it, all images must have one size.
+    Images come by the numbers in their names. Stamps begin at 0; they are the video's own, or
+    equidistant if `rate_hz` is given. `camera` (fx, fy, cx, cy, distortion) may be null for
+    detectors; with it, all images must have one size.
     `scenes` are the true scenes, [seconds, scene] by rising time, the first at 0; null: unknown.
     """
 
@@ -156,7 +157,7 @@ class Video:
 
 
 class _Folder:
-    """Images in the order of their names."""
+    """Images in their order."""
 
     rate_hz = _FOLDER_RATE_HZ
 
@@ -218,8 +219,7 @@ def _footage(path: Path) -> _Footage:
         check_regular(path, "a film or a folder of images")
         if path.suffix.lower() not in _IMAGES:
             return _Film(path)
-    inside = sorted(path.iterdir()) if path.is_dir() else [path]
-    files = [file for file in inside if file.suffix.lower() in _IMAGES]
+    files = files_by_number(path, _IMAGES) if path.is_dir() else [path]
     if not files:
         raise InputError(f"the folder holds no images ({' '.join(sorted(_IMAGES))}): {path}")
     return _Folder(files)

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from codecs import BOM_UTF16_BE, BOM_UTF16_LE
+from collections.abc import Collection
 from pathlib import Path
 
 from sceneslam.types.errors import InputError, text_of
+
+_WHOLE_NUMBER = re.compile(r"(?<!\d)(?<!\d\.)\d+")  # not the decimals of a stamp, as in 1.25.png
 
 
 def given_path(path: str) -> Path:
@@ -39,6 +43,20 @@ def given_folder(path: str, expected: str = "a folder") -> Path:
     return folder
 
 
+def files_by_number(folder: Path, suffixes: Collection[str]) -> list[Path]:
+    """Return what a folder holds with one of the suffixes (lower case), 2.png before 10.png.
+
+    Hidden files are left out: macOS writes a `._name` beside each file on other systems' disks. A
+    folder that does not exist holds nothing; raises InputError for one that cannot be read.
+    """
+    try:
+        inside = sorted(folder.iterdir()) if folder.is_dir() else []
+    except OSError as error:
+        raise InputError(f"a folder cannot be read ({text_of(error)}): {folder}") from error
+    found = [path for path in inside if path.suffix.lower() in suffixes and path.name[0] != "."]
+    return sorted(found, key=lambda path: _WHOLE_NUMBER.sub(_padded, path.name))
+
+
 def check_regular(file: Path, expected: str) -> None:
     """Raise InputError for what exists and is no regular file."""
     if not file.is_file():
@@ -58,3 +76,7 @@ def read_text(file: Path) -> str:
         return data.decode(encoding, errors="replace")
     except OSError as error:
         raise InputError(f"a file cannot be read ({text_of(error)}): {file}") from error
+
+
+def _padded(number: re.Match[str]) -> str:
+    return number[0].zfill(255)  # no name is longer

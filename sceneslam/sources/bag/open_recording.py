@@ -15,7 +15,7 @@ from sceneslam.sources.bag.mcap_file import open_mcap
 from sceneslam.sources.bag.recording import Message, Recording
 from sceneslam.sources.bag.ros1_file import open_bag
 from sceneslam.types.errors import InputError, text_of
-from sceneslam.types.input_files import check_regular
+from sceneslam.types.input_files import check_regular, files_by_number
 
 _FIRST_LOOK_BACK_NS = 2_000_000_000
 
@@ -44,7 +44,7 @@ def open_recording(path: Path) -> Recording:
 
 
 def _open_folder(path: Path) -> Recording:
-    files = sorted(path.glob("*.mcap"))
+    files = files_by_number(path, {".mcap"})
     metadata = path / "metadata.yaml"
     if files and not _packs_messages(metadata):
         return open_mcap(files)
