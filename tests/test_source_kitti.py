@@ -163,6 +163,12 @@ def test_damaged_scans_are_passed_over_and_named(tmp_path: Path) -> None:
     assert "000001.bin" in fault
 
 
+def test_scans_of_nuscenes_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "lidar__1532402927647951.pcd.bin").write_bytes(bytes(20 * 4))
+    with pytest.raises(InputError, match="nuScenes', of five numbers a point, expected KITTI's"):
+        make_source("kitti", tmp_path)
+
+
 def test_points_that_are_no_numbers_are_dropped(tmp_path: Path) -> None:
     folder = make_folder(tmp_path / "a", count=1)
     broken = POINTS.copy()

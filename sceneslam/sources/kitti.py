@@ -122,6 +122,11 @@ class Kitti(StampedScans):
 def _scan_files(folder: Path) -> Sequence[Path]:
     for name in (*_FOLDERS, "."):
         files = files_by_number(folder / name, {".bin"})
+        if any(file.name.endswith(".pcd.bin") for file in files):
+            raise InputError(
+                "scans: *.pcd.bin are nuScenes', of five numbers a point, expected KITTI's *.bin, "
+                f"of four: {folder}"
+            )
         if files:
             return files
     raise InputError(f"no scans, expected velodyne/*.bin or velodyne_points/data/*.bin: {folder}")
