@@ -129,6 +129,12 @@ def test_home_folder_is_found(film, monkeypatch) -> None:
     assert make_source("video", "~/clip.mp4").length == len(GREYS)
 
 
+def test_name_of_a_film_may_hold_a_colon(film, monkeypatch) -> None:
+    film.rename(film.with_name("10:30.mp4"))
+    monkeypatch.chdir(film.parent)
+    assert make_source("video", "10:30.mp4").length == len(GREYS)
+
+
 def test_pipe_is_no_footage(images) -> None:
     os.mkfifo(images / "004.5.png")  # reading it waits for its writer
     source = make_source("video", images)

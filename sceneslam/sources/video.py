@@ -196,7 +196,8 @@ class _Film:
 
     def _open(self) -> cv2.VideoCapture:
         level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-        film = cv2.VideoCapture(str(self._path), cv2.CAP_FFMPEG)
+        path = self._path.absolute()  # FFmpeg takes what is before a colon for a protocol
+        film = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
         cv2.utils.logging.setLogLevel(level)  # failures are reported below
         if not film.isOpened():
             raise InputError(f"film: expected a file that FFmpeg can read, or images: {self._path}")
