@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from shutil import copytree
 
 import numpy as np
 import pytest
@@ -257,6 +258,15 @@ def test_a_damaged_sqlite_bag_is_one_sentence(shared_data: Path, tmp_path: Path)
         (folder / file.name).write_bytes(data[: len(data) // 3] if file.suffix == ".db3" else data)
     with pytest.raises(InputError, match="cannot be read"):
         list(make_source("rosbag", folder))
+
+
+@pytest.mark.parametrize("odd", ["#", "?", "%20"])
+def test_a_character_that_no_path_of_an_sqlite_bag_may_have_is_named(
+    shared_data: Path, tmp_path: Path, odd: str
+) -> None:
+    copytree(shared_data / "bags" / "hokuyo_scan_db3", tmp_path / f"run{odd}1")
+    with pytest.raises(InputError, match=re.escape(f"no SQLite file with '{odd}' in its path")):
+        make_source("rosbag", tmp_path / f"run{odd}1")
 
 
 def test_a_definition_in_idl_may_be_of_several_files() -> None:

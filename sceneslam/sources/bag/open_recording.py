@@ -126,4 +126,8 @@ class FolderRecording:
             yield
         except Exception as err:  # sqlite3, yaml, zstd and rosbags have their own exceptions
             reason = " ".join(str(err).split()) or type(err).__name__
+            # rosbags makes a URI of the path, in which these characters have a meaning.
+            odd = re.match(r"Cannot open database .*?([#?]|%[0-9a-fA-F]{2})", reason)
+            if odd is not None:
+                reason = f"rosbags opens no SQLite file with {odd[1]!r} in its path: rename it"
             raise InputError(f"recording cannot be read ({reason}): {self._path}") from err
