@@ -142,6 +142,26 @@ def test_a_cut_off_picture_is_damaged(suffix: str) -> None:
         assert pixels.decode_bgr(data[:length]) is None
 
 
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_bytes_after_the_end_of_a_picture_are_passed_over(suffix: str) -> None:
+    data = cv2.imencode(suffix, np.tile(BGR, (20, 20, 1)))[1].tobytes()
+    for behind in (bytes(4096), b"a note" * 100):
+        np.testing.assert_array_equal(pixels.decode_bgr(data + behind), pixels.decode_bgr(data))
+
+
+@pytest.mark.parametrize("options", [[], [cv2.IMWRITE_JPEG_PROGRESSIVE, 1]])
+def test_a_thumbnail_does_not_end_a_cut_off_picture(options: list[int]) -> None:
+    small, large = (
+        cv2.imencode(".jpg", np.tile(BGR, (times, times, 1)), options)[1].tobytes()
+        for times in (1, 20)
+    )
+    note = b"\xff\xe1" + (len(small) + 2).to_bytes(2, "big") + small  # as in Exif
+    data = large[:2] + note + large[2:]
+    np.testing.assert_array_equal(pixels.decode_bgr(data), pixels.decode_bgr(large))
+    for length in range(len(note), len(data) - 1, len(data) // 50):
+        assert pixels.decode_bgr(data[:length]) is None
+
+
 def scan(tmp_path: Path, ranges: list[float], **changes: float) -> Any:
     with Recorder(tmp_path / "one.mcap") as recorder:
         recorder.scan("/scan", STAMP_NS, ranges, **changes)

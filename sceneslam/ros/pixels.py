@@ -12,18 +12,19 @@ from sceneslam.types.errors import ConfigError
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 
-_PNG, _JPEG = b"\x89PNG", b"\xff\xd8"
+_FORMATS = (  # what a file begins with, what is before its pixels, and before its end
+    (b"\x89PNG", b"IDAT", b"IEND"),
+    (b"\xff\xd8", b"\xff\xda", b"\xff\xd9"),  # JPEG
+)
 
 
 def decode(data: bytes, flags: int) -> NDArray[Any] | None:
     """Return the pixels of an image file (JPEG, PNG, ...), None if it is damaged or cut off.
 
-    `flags` are OpenCV's: IMREAD_COLOR for BGR, IMREAD_UNCHANGED for the stored format.
+    `flags` are OpenCV's: IMREAD_COLOR for BGR, IMREAD_UNCHANGED for the stored format. Bytes after
+    the image's end are passed over: drivers pad their images, and cameras add notes to them.
     """
-    is_cut = (data[:4] == _PNG and b"IEND" not in data[-64:]) or (
-        data[:2] == _JPEG and b"\xff\xd9" not in data[-64:]
-    )
-    if not data or is_cut:
+    if not data or any(_is_cut(data, *marks) for marks in _FORMATS):
         return None
     try:
         pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
@@ -36,6 +37,14 @@ def decode_bgr(data: bytes) -> NDArray[np.uint8] | None:
     """Return the image (H, W, 3) uint8 BGR of a file's bytes, None if it is damaged."""
     pixels = decode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     return None if pixels is None else locked(pixels)
+
+
+def _is_cut(data: bytes, begin: bytes, scan: bytes, end: bytes) -> bool:
+    """Tell whether a file of this format has pixels without an end; a thumbnail has its own."""
+    if not data.startswith(begin):
+        return False
+    at = data.rfind(end)
+    return at < 0 or scan in data[at:]
 
 
 def image_options(image_format: str, jpeg_quality: int) -> list[int]:
