@@ -104,6 +104,20 @@ def compressed(tmp_path: Path, data: bytes, encoding: str) -> Any:
     return decoded(tmp_path / "one.mcap")
 
 
+@pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
+def test_a_bayer_mosaic_gets_its_colours_raw_and_compressed(tmp_path: Path, pattern: str) -> None:
+    """Compressed, it is a grey file, unless its driver stored the colours."""
+    colour = np.full((6, 8, 3), (10, 100, 200), np.uint8)
+    tile = np.array([dict(zip("bgr", colour[0, 0], strict=True))[letter] for letter in pattern])
+    mosaic = np.tile(tile.reshape(2, 2), (3, 4))
+    raw = image(tmp_path, mosaic, f"bayer_{pattern}8")
+    np.testing.assert_array_equal(decode.image_bgr(raw), colour)
+    for suffix, stored in ((".png", mosaic), (".jpg", mosaic), (".png", colour)):
+        data = cv2.imencode(suffix, stored)[1].tobytes()
+        message = compressed(tmp_path, data, f"bayer_{pattern}8; {suffix[1:]} compressed ")
+        np.testing.assert_allclose(decode.image_bgr(message), colour, atol=8)
+
+
 def test_compressed_depth_of_both_kinds_is_read(tmp_path: Path) -> None:
     png = cv2.imencode(".png", DEPTH_MM)[1].tobytes()
     header = np.zeros(3, "<f4").tobytes()

@@ -95,7 +95,7 @@ def image_bgr(message: Any) -> NDArray[np.uint8] | None:
     """
     encoding, is_compressed = _encoding(message)
     if is_compressed:
-        return pixels.decode_bgr(message.data.tobytes())
+        return _compressed_bgr(message.data.tobytes(), encoding.split(";")[0].strip())
     if encoding not in _COLOR:
         allowed = ", ".join(sorted(_COLOR))
         raise InputError(f"image encoding: got {encoding!r}, allowed: {allowed}")
@@ -105,11 +105,7 @@ def image_bgr(message: Any) -> NDArray[np.uint8] | None:
         return None
     if dtype == "u2":
         raw = (raw >> 8).astype(np.uint8)
-    try:
-        image = raw if conversion is None else cv2.cvtColor(raw, conversion)
-    except cv2.error:  # an odd width, of which YUV has none
-        return None
-    return pixels.locked(np.ascontiguousarray(image, dtype=np.uint8))
+    return _converted(raw, conversion)
 
 
 def depth_m(message: Any, units: pixels.DepthUnits) -> NDArray[np.float32] | None:
@@ -242,6 +238,23 @@ def _encoding(message: Any) -> tuple[str, bool]:
     if message.__msgtype__ == "sensor_msgs/msg/CompressedImage":
         return str(message.format), True
     return str(message.encoding), False
+
+
+def _compressed_bgr(data: bytes, encoding: str) -> NDArray[np.uint8] | None:
+    """Return the image of a file's bytes; one of a Bayer pattern may be stored as its mosaic."""
+    if encoding.startswith("bayer_") and encoding in _COLOR:
+        stored = pixels.decode(data, cv2.IMREAD_UNCHANGED)
+        if stored is not None and stored.ndim == 2 and stored.dtype == np.uint8:
+            return _converted(stored, _COLOR[encoding][2])
+    return pixels.decode_bgr(data)
+
+
+def _converted(raw: NDArray[Any], conversion: int | None) -> NDArray[np.uint8] | None:
+    try:
+        image = raw if conversion is None else cv2.cvtColor(raw, conversion)
+    except cv2.error:  # an odd width, of which YUV has none
+        return None
+    return pixels.locked(np.ascontiguousarray(image, dtype=np.uint8))
 
 
 def _coefficients(message: Any, letter: str) -> NDArray[np.float64]:
