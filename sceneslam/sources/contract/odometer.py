@@ -20,20 +20,24 @@ _SLACK_AT_ORIGIN = 0.1  # of both
 _ORIGIN_M, _ORIGIN_RAD = 0.05, 0.05  # closer poses count as the origin
 _BOOST_M_S2, _BOOST_RAD_S2 = 10.0, 20.0
 _COAST_S = 0.5  # longer ago, the last velocity is no prediction any more
+SPEED_MAX_MPS = 70.0  # of any vehicle: 250 km/h
 
 
 class Odometer:
     """Removes jumps from the odometry of successive observations.
 
     A jump is a motion that exceeds any vehicle's acceleration. It is replaced by the previous
-    velocity, for half a second at most.
+    velocity, for half a second at most. A translation that repeats is a velocity, not a jump.
     """
 
     def __init__(self) -> None:
         self._before: Observation | None = None  # the last with odometry, unchanged
         self._T_smooth_odom: Transform | None = None  # None until the first jump
-        self._rates = np.zeros(2)  # of the last step [m/s, rad/s] ...
-        self._twist = np.zeros(6)  # ... and its motion per second
+        # Of the last step [m/s, rad/s]. Twice of it is plausible in the next one: in the first one
+        # any vehicle's speed, as recordings begin while it drives.
+        self._rates = np.array([SPEED_MAX_MPS / 2, 0.0])
+        self._twist = np.zeros(6)  # the last step's motion per second
+        self._jump_mps: NDArray[np.float64] | None = None  # (3,), base, if the last step jumped
 
     @property
     def T_smooth_odom(self) -> Transform:
@@ -67,10 +71,16 @@ class Odometer:
 
     def _take(self, T_prev_curr: Transform, duration_s: float, slack: NDArray[np.float64]) -> bool:
         """Tell whether a motion is plausible after the previous step; if so, store its velocity."""
-        moved = _moved(T_prev_curr)
-        boost = np.array([_BOOST_M_S2, _BOOST_RAD_S2]) * duration_s**2
-        if (moved > slack + 2.0 * self._rates * duration_s + boost).any():
+        moved, velocity_mps = _moved(T_prev_curr), T_prev_curr[:3, 3] / duration_s
+        excess = slack + np.array([_BOOST_M_S2, _BOOST_RAD_S2]) * duration_s**2
+        is_far, is_turned = moved > excess + 2.0 * self._rates * duration_s
+        if is_far and self._jump_mps is not None:
+            changed_mps = float(np.linalg.norm(velocity_mps - self._jump_mps))
+            is_far = changed_mps * duration_s > excess[0]
+        if is_far or is_turned:
+            self._jump_mps = velocity_mps
             return False
+        self._jump_mps = None
         self._rates, self._twist = moved / duration_s, se3.log(T_prev_curr) / duration_s
         return True
 

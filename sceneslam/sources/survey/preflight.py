@@ -13,6 +13,7 @@ from math import atan, degrees
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.sources.contract.odometer import SPEED_MAX_MPS
 from sceneslam.sources.survey.survey import Stream, Survey
 from sceneslam.types.rig import Camera, Rig, Sensor
 
@@ -21,7 +22,6 @@ _SCALES = (1000.0, 5000.0)  # units per metre in use: millimetres, and those of 
 _FITS = 0.98  # share of depths in range that confirms a scale
 _FIELD_OF_VIEW_DEG = (15.0, 150.0)  # of a pinhole camera, horizontal
 _OFF_CENTRE = 0.25  # of the image's size; a principal point is within some per cent of the centre
-_SPEED_MAX_MPS = 70.0  # 250 km/h
 _TURN_MAX_RADPS = 35.0  # gyros measure up to 2000 degrees per second
 _RETURNS_MIN = 0.02  # share of beams with a return; less in open fields only
 _CLOCKS_APART_S = 1.0  # drivers deliver earlier; TAI, which PTP has, is 37 s ahead of UTC
@@ -217,7 +217,7 @@ def _of_motion(survey: Survey) -> Iterator[str]:
         steps_m = np.linalg.norm(np.diff(positions_m, axis=0), axis=1)
         speeds = steps_m[steps_s > 0] / steps_s[steps_s > 0]
         speed = float(np.percentile(speeds, 90)) if len(speeds) else 0.0
-        if speed > _SPEED_MAX_MPS:
+        if speed > SPEED_MAX_MPS:
             place = getattr(survey.stream(Sensor.ODOMETRY), "place", "")
             yield f"{place}: {speed:.3g} m/s are implausible; is its unit the metre?"
     if len(survey.gyro_radps):
