@@ -202,6 +202,15 @@ def test_a_pause_stays_where_it_was_and_exact_stamps_stay_as_they_are() -> None:
     np.testing.assert_array_equal(measured_stamps(exact_ns), exact_ns)
 
 
+@pytest.mark.parametrize("rates", [((600, 0.5), (300, 0.2)), ((300, 0.2), (600, 0.5))])
+def test_scans_of_a_rate_that_changes_stay_where_they_were(
+    rates: tuple[tuple[int, float], ...],
+) -> None:
+    steps_ns = np.repeat([int(period_s * 1e9) for _, period_s in rates], [n for n, _ in rates])
+    exact_ns = np.cumsum(steps_ns)
+    np.testing.assert_allclose(measured_stamps(exact_ns), exact_ns, atol=1000, rtol=0)
+
+
 @given(st.lists(st.integers(0, 10**6), max_size=60))
 def test_measured_stamps_rise(places: list[int]) -> None:
     assert (np.diff(measured_stamps(np.array(places, dtype=np.int64) * 10**6)) > 0).all()

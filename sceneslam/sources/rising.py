@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 _SPAN = 200  # scans over which the period is measured: bursts average out
 _BACKLOG = 20  # scans that wait at most until they are stamped: 3.3 s in Intel's log
 _CLOSEST = 0.1  # of the period: so far apart are any two scans
+_FASTER = 0.8  # of the usual period: the scanner turns faster; a backlog makes 0.9 of a mean
 
 
 def longest_rising(stamps_ns: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -63,13 +64,25 @@ def measured_stamps(received_ns: NDArray[np.int64]) -> NDArray[np.int64]:
     if count < 2:
         return received_ns
     span = min(_SPAN, count - 1)
-    period_ns = max(
-        float(np.median(received_ns[span:] - received_ns[:-span])) / span, 1.0 / _CLOSEST
-    )
-    regular_ns = np.rint(np.arange(count) * period_ns).astype(np.int64)
+    spans_ns = received_ns[span:] - received_ns[:-span]
+    period_ns = max(float(np.median(spans_ns)) / span, 1.0 / _CLOSEST)
+    periods = _periods(spans_ns / (span * period_ns), span)
+    regular_ns = np.rint(periods * period_ns).astype(np.int64)
     late_ns = received_ns - regular_ns
     padded = np.pad(late_ns, (0, _BACKLOG), constant_values=np.iinfo(np.int64).max)
     least_ns = sliding_window_view(padded, _BACKLOG + 1).min(axis=1)
     spaced_ns = np.rint(np.arange(count) * _CLOSEST * period_ns).astype(np.int64)
     apart_ns = np.maximum.accumulate(least_ns + regular_ns - spaced_ns)
     return np.asarray(apart_ns + spaced_ns)
+
+
+def _periods(spans: NDArray[np.float64], span: int) -> NDArray[np.float64]:
+    """Return how many usual periods after the first each of N scans is due.
+
+    `spans` (N - span,) are the mean periods of `span` scans, as shares of the usual one. Where the
+    rate has risen, the period is that of the scans before or after, whichever is shorter.
+    """
+    places = np.arange(len(spans) + span - 1)
+    before, after = (spans[at.clip(0, len(spans) - 1)] for at in (places - span + 1, places))
+    local = np.minimum(before, after)
+    return np.append(0.0, np.cumsum(np.where(local < _FASTER, local, 1.0)))
