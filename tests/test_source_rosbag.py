@@ -192,6 +192,21 @@ def test_rectified_images_are_known_by_their_topic(tmp_path: Path, topic: str, f
     assert make_source("mcap", tmp_path / "a.mcap").rig.camera.fx == fx
 
 
+@pytest.mark.parametrize(("frame", "fx"), [("right_optical", None), ("left_optical", 50.0)])
+def test_camera_info_of_another_camera_is_not_taken(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, frame: str, fx: float | None
+) -> None:
+    """Of another namespace, it is the image's if it has its frame, as that of aligned depth has."""
+    info = camera_info(p=[0.0] * 8)
+    info.header.frame_id = frame
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        recorder.image("/left/image_raw", STAMP_NS, COLOR, "bgr8", frame="left_optical")
+        recorder.add("/right/camera_info", STAMP_NS, info)
+    camera = make_source("mcap", tmp_path / "a.mcap").rig.camera
+    assert (None if camera is None else camera.fx) == fx
+    assert ("camera_info of /left/image_raw is missing" in caplog.text) == (fx is None)
+
+
 def test_given_intrinsics_replace_those_of_a_lens_that_opencv_does_not_have(tmp_path: Path) -> None:
     info = camera_info(p=[0.0] * 8)
     info.distortion_model, info.d = "equidistant", np.full(4, 0.1)

@@ -78,8 +78,8 @@ def choose_topics(recording: Recording, given: Mapping[str, str | None]) -> BagT
     for need, candidates in found.items():
         chosen.setdefault(need, _only(need, candidates))
     picture = chosen["image"] if chosen["image"] != NONE else chosen["depth"]
-    infos = _of_type(recording, TYPES["camera_info"])
-    chosen.setdefault("camera_info", _only("camera_info", _beside(picture, infos)))
+    if "camera_info" not in chosen:
+        chosen["camera_info"] = _camera_info(recording, picture)
     return BagTopics(**{need: None if name == NONE else name for need, name in chosen.items()})
 
 
@@ -90,6 +90,20 @@ def first(recording: Recording, topic: str) -> Any:
         if decoded is not None:
             return decoded
     return None
+
+
+def infos_of(recording: Recording, picture: str) -> list[str]:
+    """Return the CameraInfo topic in an image topic's nearest namespace, else those of its frame.
+
+    Those of other frames belong to other cameras.
+    """
+    infos, parts = _of_type(recording, TYPES["camera_info"]), picture.split("/")
+    for length in range(len(parts) - 1, 0, -1):
+        candidate = "/".join([*parts[:length], "camera_info"])
+        if candidate in infos:
+            return [candidate]
+    frame = _frame(recording, picture)
+    return [name for name in infos if frame is not None and _frame(recording, name) == frame]
 
 
 def describe(recording: Recording) -> str:
@@ -142,14 +156,18 @@ def _prefer(topics: Sequence[str], is_better: Callable[[str], bool]) -> list[str
     return [name for name in topics if is_better(name)] or list(topics)
 
 
-def _beside(picture: str | None, infos: Sequence[str]) -> list[str]:
-    """Return the CameraInfo topic in the image topic's nearest namespace, else all."""
-    parts = (picture or "").split("/")
-    for length in range(len(parts) - 1, 0, -1):
-        candidate = "/".join([*parts[:length], "camera_info"])
-        if candidate in infos:
-            return [candidate]
-    return list(infos)
+def _camera_info(recording: Recording, picture: str) -> str:
+    infos = infos_of(recording, picture)
+    others = ", ".join(_of_type(recording, TYPES["camera_info"]))
+    if not infos and others and picture != NONE:
+        _log.warning("camera_info of %s is missing, there is only %s", picture, others)
+    return _only("camera_info", infos)
+
+
+def _frame(recording: Recording, topic: str) -> str | None:
+    """Return the frame of a topic's first message, None without one."""
+    message = first(recording, topic)
+    return None if message is None else decode.frame_id(message)
 
 
 def _only(need: str, candidates: Sequence[str]) -> str:
