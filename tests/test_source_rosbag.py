@@ -10,6 +10,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from rosbags.typesys import Stores, get_typestore
 
 from sceneslam.ros.encode import Encoder
+from sceneslam.sources.survey.preflight import preflight
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.rig import Camera, Sensor, optical_to_rep103
@@ -158,6 +159,36 @@ def test_depth_without_intrinsics_asks_for_them(tmp_path: Path) -> None:
     source = make_source("mcap", path, camera=given)
     assert source.rig.camera.fy == 41.0
     assert all(one.has(Sensor.DEPTH) for one in source)
+
+
+@pytest.mark.parametrize(
+    ("frame", "x_m", "fx", "is_odd"),
+    [
+        ("depth", None, 50.0, False),  # the driver names its own frame, and registers all the same
+        ("depth", 0.0, 50.0, False),
+        ("depth", 0.025, 50.0, True),
+        ("depth", None, 60.0, True),
+        ("cam", None, 60.0, False),
+    ],
+)
+def test_depth_that_is_not_registered_to_the_images_is_a_warning(
+    tmp_path: Path, frame: str, x_m: float | None, fx: float, is_odd: bool
+) -> None:
+    info = camera_info(p=[0.0] * 8)
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        if x_m is not None:
+            tree = [transform(recorder, "cam", "depth", x_m)]
+            recorder.add("/tf_static", 0, recorder.new("tf2_msgs/msg/TFMessage", transforms=tree))
+        recorder.add("/rgb/camera_info", STAMP_NS, info)
+        info.k = np.array([fx, *info.k[1:]])
+        recorder.add("/depth/camera_info", STAMP_NS, info)
+        recorder.image("/rgb/image", STAMP_NS, COLOR, "bgr8")
+        recorder.image("/depth/image", STAMP_NS, DEPTH, "16UC1", frame=frame)
+    source = make_source("mcap", tmp_path / "a.mcap")
+    odd = source.survey().odd
+    assert len(odd) == is_odd
+    assert all("/depth/image (frame 'depth')" in one and "registered" in one for one in odd)
+    assert set(odd) <= set(preflight(source.survey(), source.rig).warnings)
 
 
 def test_float_depth_without_one_number_is_told(tmp_path: Path) -> None:

@@ -194,7 +194,7 @@ def camera(message: Any, *, is_rectified: bool = False) -> Camera | None:
     Rectified images have the lens of P, if it is given, without distortion. Raises InputError for
     a lens that OpenCV does not have.
     """
-    k, d, p = (_coefficients(message, letter) for letter in "kdp")
+    k, d, p = (coefficients(message, letter) for letter in "kdp")
     if is_rectified and p[0] > 0:
         k, d = p.reshape(3, 4)[:, :3].ravel(), np.zeros(0)
     if not (k[0] > 0 and k[4] > 0 and np.isfinite([*k, *d]).all()):
@@ -213,6 +213,12 @@ def camera(message: Any, *, is_rectified: bool = False) -> Camera | None:
         cy=float(k[5]),
         distortion=distortion,
     )
+
+
+def coefficients(message: Any, letter: str) -> NDArray[np.float64]:
+    """Return CameraInfo's `k` (9,), `d` (N,) or `p` (12,); they are `K`, `D` and `P` in ROS 1."""
+    values = vars(message)
+    return np.asarray(values.get(letter, values.get(letter.upper())), dtype=np.float64)
 
 
 def transforms(message: Any) -> Iterator[FrameTransform]:
@@ -255,12 +261,6 @@ def _converted(raw: NDArray[Any], conversion: int | None) -> NDArray[np.uint8] |
     except cv2.error:  # an odd width, of which YUV has none
         return None
     return pixels.locked(np.ascontiguousarray(image, dtype=np.uint8))
-
-
-def _coefficients(message: Any, letter: str) -> NDArray[np.float64]:
-    """Return CameraInfo's `k`, `d` or `p`, which are `K`, `D` and `P` in ROS 1."""
-    values = vars(message)
-    return np.asarray(values.get(letter, values.get(letter.upper())), dtype=np.float64)
 
 
 def _raw(message: Any, dtype: str, channels: int) -> NDArray[Any] | None:

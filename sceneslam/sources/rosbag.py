@@ -19,6 +19,7 @@ from sceneslam.sources.bag.rig import (
     picture_size_wh,
     sensor_topics,
     unplaced,
+    unregistered,
 )
 from sceneslam.sources.bag.synchronise import Sample, SynchronisedSamples, Synchroniser
 from sceneslam.sources.bag.topics import choose_topics, describe
@@ -129,6 +130,7 @@ class RosBag:
             sync_tolerance_s=self._sync_tolerance_s,
             mounts=self._mounts,
             unplaced=self._unplaced(),
+            odd=list(unregistered(self._recording, self._topics, self._frames)),
         )
 
     def ground_truth(self) -> GroundTruth | None:

@@ -37,13 +37,13 @@ class FrameTree:
 
     def T_base(self, frame: str) -> Transform | None:
         """Return T_base_frame (4, 4) [m]; None if no chain of transforms connects both."""
-        if self.base is None:
-            return None
-        base_root, T_root_base = self._to_root(self.base)
-        frame_root, T_root_frame = self._to_root(frame)
-        if base_root != frame_root:
-            return None
-        return se3.inverse(T_root_base) @ T_root_frame
+        return None if self.base is None else self.between(self.base, frame)
+
+    def between(self, first: str, second: str) -> Transform | None:
+        """Return T_first_second (4, 4) [m]; None if no chain of transforms connects both."""
+        first_root, T_root_first = self._to_root(first)
+        second_root, T_root_second = self._to_root(second)
+        return se3.inverse(T_root_first) @ T_root_second if first_root == second_root else None
 
     def _to_root(self, frame: str) -> tuple[str, Transform]:
         T_root_frame, met = se3.identity(), {frame}

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any
+
+import numpy as np
 
 from sceneslam.ros import decode, names, pixels
 from sceneslam.sources.bag.frames import FrameTree
 from sceneslam.sources.bag.observation import Mounts
 from sceneslam.sources.bag.recording import Recording
-from sceneslam.sources.bag.topics import BagTopics, first
+from sceneslam.sources.bag.topics import BagTopics, first, infos_of
 from sceneslam.sources.intrinsics import Intrinsics
 from sceneslam.types import se3
 from sceneslam.types.errors import InputError
@@ -97,6 +99,24 @@ def unconnected(recording: Recording, topics: Sequence[str], frames: FrameTree) 
     messages = [first(recording, topic) for topic in topics]
     found = dict.fromkeys(decode.frame_id(one) for one in messages if one is not None)
     return [name for name in found if not frames.is_base(name) and frames.T_base(name) is None]
+
+
+def unregistered(recording: Recording, topics: BagTopics, frames: FrameTree) -> Iterator[str]:
+    """Yield a sentence if depth was measured through another lens or elsewhere than the images."""
+    pictures = [first(recording, topic) for topic in (topics.image, topics.depth) if topic]
+    seen_in = [decode.frame_id(message) for message in pictures if message is not None]
+    if len(seen_in) < 2 or seen_in[0] == seen_in[1]:
+        return
+    T_image_depth = frames.between(*seen_in)
+    is_apart = T_image_depth is not None and not np.allclose(T_image_depth, np.eye(4), atol=1e-6)
+    of_depth = infos_of(recording, topics.depth or "")[:1]
+    infos = [first(recording, topic) for topic in (topics.camera_info, *of_depth) if topic]
+    lenses = [decode.coefficients(info, "k") for info in infos if info is not None]
+    if is_apart or (len(lenses) == 2 and not np.allclose(*lenses)):
+        yield (
+            f"{topics.depth} (frame {seen_in[1]!r}) has another lens or position than "
+            f"{topics.image} (frame {seen_in[0]!r}): depth has to be registered to the images"
+        )
 
 
 def find_mounts(recording: Recording, topics: BagTopics, frames: FrameTree) -> Mounts:

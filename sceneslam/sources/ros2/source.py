@@ -19,6 +19,7 @@ from sceneslam.sources.bag.rig import (
     picture_size_wh,
     sensor_topics,
     unplaced,
+    unregistered,
 )
 from sceneslam.sources.bag.synchronise import Sample, SynchronisedSamples, Synchroniser
 from sceneslam.sources.bag.topics import NONE, TYPES, choose_topics
@@ -129,7 +130,10 @@ class Ros2(Measuring):
             mounts=self._mounts,
             unplaced=self._unplaced(),
             silent=sorted(self.heard.announced.keys() - self.heard.topics.keys()),
-            odd=list(oddities(self.heard, [name for name in self._named.values() if name])),
+            odd=[
+                *oddities(self.heard, [name for name in self._named.values() if name]),
+                *unregistered(self.heard, self.topics, self.frames),
+            ],
         )
 
     def close(self) -> None:
