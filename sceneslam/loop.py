@@ -23,7 +23,7 @@ from sceneslam.config.settings import LIVE
 from sceneslam.engine.live import LiveTally, Spent, run_live
 from sceneslam.engine.open_sinks import OpenSinks
 from sceneslam.engine.slowest import Stopwatch
-from sceneslam.engine.steering import Operator, SteeredDetector
+from sceneslam.engine.steering import Operator
 from sceneslam.executors import executor
 from sceneslam.interfaces import Live, LiveFeed, closes_own_loops
 from sceneslam.keeping import Keeping
@@ -65,16 +65,11 @@ class RunLoop:
         self._live, self._watch = LiveTally(), Stopwatch()
         self._covariances = np.zeros((0, 6, 6))
         self._began_s, self._wall_s = perf_counter(), 0.0
-        detector = SteeredDetector(parts.detector)
         is_live = parts.run.mode == LIVE
-        saver = executor("save", is_live=is_live)
-        self._operator = Operator(
-            detector, parts.scenes, save_map, results.folder, self._log.add, saver
-        )
         with ExitStack() as opened:  # closed again if anything cannot be opened
             opened.callback(self.close, is_saved=True)
             self._bus = Bus(
-                detector=detector,
+                detector=parts.detector,
                 modules=parts.modules,
                 scenes=parts.scenes,
                 policy=parts.policy,
@@ -85,6 +80,15 @@ class RunLoop:
                 is_live=is_live,
             )
             opened.callback(self._bus.close, 0)
+            self._operator = Operator(
+                parts.detector.scenes,
+                self._bus.select,
+                parts.scenes,
+                save_map,
+                results.folder,
+                self._log.add,
+                executor("save", is_live=is_live),
+            )
             closing = [key for key, module in parts.modules.items() if closes_own_loops(module)]
             is_one = len(closing) == len(parts.modules) == 1  # it recognizes its places itself
             opened.callback(parts.atlas.finish)

@@ -36,7 +36,7 @@ def drive(modules, *, steps=100, scene_at=lambda i: "Bright", table=TABLE, **opt
     """Run the bus over a straight drive; return it with its atlas, log and detector."""
     has_odometry = options.pop("has_odometry", True)
     catch_up_steps, is_live = options.pop("catch_up_steps", None), options.pop("is_live", False)
-    rig = options.pop("rig", RIG)
+    rig, selected = options.pop("rig", RIG), options.pop("selected", "")
     feed = options.pop("feed", lambda index: observation(index, has_odometry=has_odometry))
     atlas, log, detector = Atlas(voxel_m=0.05), EventLog(), ScriptedDetector(scene_at)
     bus = Bus(
@@ -50,6 +50,7 @@ def drive(modules, *, steps=100, scene_at=lambda i: "Bright", table=TABLE, **opt
         catch_up_steps=catch_up_steps,
         is_live=is_live,
     )
+    bus.select(selected)
     for index in range(steps):
         if bus.state == "terminate":
             break

@@ -169,7 +169,7 @@ def test_map_is_saved_beside_the_pose_and_its_failure_is_told(tmp_path):
 
     nothing = PointLayer(points=np.zeros((0, 3), np.float32))
     hybrid = HybridMap(points=nothing, point_modules=np.zeros(0, np.uint8), modules=())
-    operator = Operator(None, TABLE, save, tmp_path, note, executor("save", is_live=True))
+    operator = Operator((), print, TABLE, save, tmp_path, note, executor("save", is_live=True))
     for name in ("floor", "full", "a/b"):
         operator.obey(SaveMap(name=name, hybrid=hybrid), 1)
     assert [one[2] for one in told] == ["a/b"]

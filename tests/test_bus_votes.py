@@ -6,8 +6,8 @@ from dataclasses import replace
 import hostile
 import numpy as np
 import pytest
-from driving import events
-from fakes import ScriptedDetector, observation
+from driving import drive, events
+from fakes import ExactModule, ScriptedDetector, observation
 
 from sceneslam.bus.scene.scene_filter import WindowFilter
 from sceneslam.bus.scene.watch import Watch
@@ -94,3 +94,24 @@ def test_whatever_a_detector_raises_at_its_end_is_no_more_than_a_warning(error, 
     watch._detector.shutdown = lambda: hostile.throw(error)
     watch.close()
     assert "the detector could not be shut down" in caplog.text
+
+
+@pytest.mark.parametrize("has_failed", [False, True])
+def test_selected_scene_is_voted_for_until_it_is_given_back(has_failed):
+    watch, log = watched(Votes(**{"value": "grey" if has_failed else 3.0}))
+    for index, scene in enumerate(["Dark", "", "Bright"], start=1):
+        watch.selected = scene
+        watch.look(observation(10 * index))
+    scenes = ["Dark", "Bright"] if has_failed else ["Bright", "Dark", "Bright", "Bright"]
+    assert [vote["scene"] for vote in events(log, "vote")] == scenes
+    assert len(events(log, "fault")) == has_failed
+
+
+def test_run_begins_by_a_selected_scene_where_the_detector_failed():
+    def failing(index):
+        raise ValueError("no light meter")
+
+    for selected, served in (("", ""), ("Dark", "Dark")):
+        modules = {"bright": ExactModule(), "dark": ExactModule()}
+        bus, _, log, _ = drive(modules, scene_at=failing, selected=selected)
+        assert bus.scene == served and len(events(log, "fault")) == 1

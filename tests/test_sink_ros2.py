@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 from test_source_ros2 import CAMERA, scan
 
 from sceneslam.app import run
-from sceneslam.engine.steering import Operator, SteeredDetector
+from sceneslam.engine.steering import Operator
 from sceneslam.executors import InStep
 from sceneslam.modules.maps.live_map import GridAndPoints
 from sceneslam.ros import decode
@@ -25,7 +25,7 @@ from sceneslam.sinks.ros2 import sink as under_test
 from sceneslam.types import se3
 from sceneslam.types.command import Pause, SaveMap, SelectModule, SelectScene
 from sceneslam.types.errors import ConfigError
-from sceneslam.types.observation import Observation, SceneVote
+from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Laser, Rig, Sensor
 
 S = 1_000_000_000
@@ -290,27 +290,15 @@ def test_impossible_settings_are_refused(words, key):
         make(**words)
 
 
-class Bright:
-    quantity, scenes, requires = "", ("Bright", "Dark"), (frozenset(),)
-
-    def activate(self, rig):
-        pass
-
-    def get_scene(self, observation):
-        return SceneVote(stamp_ns=observation.stamp_ns, scene="Bright", value=3.0)
-
-    def shutdown(self):
-        pass
-
-
 class Desk:
     """An operator with nothing behind it."""
 
     def __init__(self, folder):
-        self.detector, self.events, self.saved = SteeredDetector(Bright()), [], []
+        self.selected, self.events, self.saved = "", [], []
         table = {"Bright": ("rgbd", "laser"), "Dark": ("laser",)}
         self.operator = Operator(
-            self.detector,
+            ("Bright", "Dark"),
+            self.select,
             table,
             lambda hybrid, path: self.saved.append(path),
             folder,
@@ -318,21 +306,20 @@ class Desk:
             InStep(),
         )
 
-    def vote(self):
-        return self.detector.get_scene(Observation(stamp_ns=0)).scene
+    def select(self, scene):
+        self.selected = scene
 
 
-def test_selected_scene_is_voted_for_until_it_is_given_back(tmp_path):
+def test_scene_is_selected_by_its_name_or_its_module_until_it_is_given_back(tmp_path):
     desk = Desk(tmp_path)
-    assert desk.vote() == "Bright"
     for command, scene in [
         (SelectScene(scene="Dark"), "Dark"),
-        (SelectScene(scene=""), "Bright"),
+        (SelectScene(scene=""), ""),
         (SelectModule(module="laser"), "Dark"),
-        (SelectModule(module=""), "Bright"),
+        (SelectModule(module=""), ""),
     ]:
         desk.operator.obey(command, 0)
-        assert desk.vote() == scene
+        assert desk.selected == scene
     assert {event["event"] for event in desk.events} == {"command"}
 
 
@@ -349,7 +336,7 @@ def test_wish_that_cannot_be_met_is_refused_with_what_can(tmp_path, command, why
     desk = Desk(tmp_path)
     desk.operator.obey(command, 0)
     assert desk.events[0]["event"] == "command_refused" and desk.events[0]["why"] == why
-    assert desk.vote() == "Bright" and not desk.saved
+    assert not desk.selected and not desk.saved
 
 
 def test_map_is_saved_under_its_name(tmp_path):

@@ -153,6 +153,10 @@ class Bus:
         own_ns = perf_counter_ns() - began_ns - (self._spent_ns() - spent_ns)
         self.bus_us.append(own_ns / 1e3 - self.detector_us[-1])
 
+    def select(self, scene: str) -> None:
+        """Take a scene for the one around the robot; "": as the detector votes."""
+        self._watch.selected = scene
+
     def close(self, stamp_ns: int) -> None:
         """End the run: shut the module down, then the detector. May be called twice."""
         if not self._machine.is_terminated:
@@ -197,7 +201,7 @@ class Bus:
         self._do = self._go_on = _wait
 
     def _await_scene(self, observation: Observation) -> Outcome | None:
-        if not self._watch.is_working:
+        if not self._watch.is_working and not self._watch.selected:
             return Outcome.FAILURE
         if self._watch.confirmed is None:
             return None

@@ -7,55 +7,9 @@ from concurrent.futures import Executor, Future
 from dataclasses import dataclass
 from pathlib import Path
 
-from sceneslam.interfaces import Detector
 from sceneslam.types.command import Command, Pause, SaveMap, SelectModule, SelectScene
 from sceneslam.types.errors import text_of
 from sceneslam.types.maps import HybridMap
-from sceneslam.types.observation import Observation, SceneVote
-from sceneslam.types.rig import Rig, Sensor
-
-_UNLIKELY = 0.01  # probability of the scenes that were not selected, for Bayes filters
-
-
-class SteeredDetector:
-    """A detector whose votes an operator can override; the policy confirms them as usual."""
-
-    def __init__(self, detector: Detector) -> None:
-        self._detector = detector
-        self.selected = ""  # the selected scene; "": the detector's own votes
-
-    @property
-    def quantity(self) -> str:
-        """Return the detector's."""
-        return self._detector.quantity
-
-    @property
-    def scenes(self) -> tuple[str, ...]:
-        """Return the detector's."""
-        return self._detector.scenes
-
-    @property
-    def requires(self) -> tuple[frozenset[Sensor], ...]:
-        """Return the detector's."""
-        return self._detector.requires
-
-    def activate(self, rig: Rig) -> None:
-        """Activate the detector."""
-        self._detector.activate(rig)
-
-    def get_scene(self, observation: Observation) -> SceneVote:
-        """Return a vote for the selected scene, with the detector's measured value."""
-        vote = self._detector.get_scene(observation)
-        if not self.selected:
-            return vote
-        likelihoods = dict.fromkeys(self.scenes, _UNLIKELY) | {self.selected: 1.0}
-        return SceneVote(
-            stamp_ns=vote.stamp_ns, scene=self.selected, value=vote.value, likelihoods=likelihoods
-        )
-
-    def shutdown(self) -> None:
-        """Shut the detector down."""
-        self._detector.shutdown()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,19 +23,21 @@ class _Saving:
 class Operator:
     """Executes commands; `note` receives the result of each as an event.
 
-    Maps are saved asynchronously by `executor`.
+    `select` takes one of `scenes`, or "" for the detector's own votes. Maps are saved
+    asynchronously by `executor`.
     """
 
     def __init__(
         self,
-        detector: SteeredDetector,
+        scenes: Sequence[str],
+        select: Callable[[str], None],
         table: Mapping[str, Sequence[str]],
         save: Callable[[HybridMap, Path], None],
         folder: Path,
         note: Callable[..., None],
         executor: Executor,
     ) -> None:
-        self._detector, self._table = detector, table
+        self._scenes, self._choose, self._table = scenes, select, table
         self._save, self._folder, self._note = save, folder, note
         self._executor = executor
         self._saving: list[_Saving] = []
@@ -134,9 +90,9 @@ class Operator:
         return ""
 
     def _select(self, scene: str) -> str:
-        if scene and scene not in self._detector.scenes:
-            return f"the detector's scenes are: {', '.join(self._detector.scenes)}"
-        self._detector.selected = scene
+        if scene and scene not in self._scenes:
+            return f"the detector's scenes are: {', '.join(self._scenes)}"
+        self._choose(scene)
         return ""
 
 

@@ -19,6 +19,7 @@ from sceneslam.types.observation import UNSURE, Observation, SceneVote
 from sceneslam.types.rig import Rig
 
 _log = logging.getLogger(__name__)
+_UNLIKELY = 0.01  # probability of the scenes that were not selected, for Bayes filters
 
 
 def log_vote(
@@ -40,13 +41,14 @@ def log_vote(
 
 
 class Watch:
-    """Runs the detector; if it fails, the last confirmed scene stays."""
+    """Runs the detector; if it fails, the last confirmed scene stays until one is selected."""
 
     def __init__(
         self, detector: Detector, rig: Rig, log: EventLog, *, scene_filter: SceneFilter
     ) -> None:
         self.spent_us = array("d")
         self.is_working = True
+        self.selected = ""  # the scene that an operator selected; "": as the detector votes
         self.confirmed: ConfirmedScene | None = None  # last, None before the first
         self._detector, self._log = detector, log
         self._filter = scene_filter
@@ -66,6 +68,8 @@ class Watch:
             self.is_working = False
             self._log.add_fault(observation.stamp_ns, str(error))
         self.spent_us.append((perf_counter_ns() - began_ns) / 1e3)
+        if self.selected:
+            vote = self._selected(observation.stamp_ns, vote)
         if vote is None:
             return
         confirmed = self._filter.update(vote)
@@ -79,6 +83,15 @@ class Watch:
                 self._detector.shutdown()
         except ModuleError as error:
             _log.warning(str(error))
+
+    def _selected(self, stamp_ns: int, vote: SceneVote | None) -> SceneVote:
+        """Return a vote for the selected scene, with the detector's measured value."""
+        return SceneVote(
+            stamp_ns=stamp_ns,
+            scene=self.selected,
+            value=math.nan if vote is None else vote.value,
+            likelihoods=dict.fromkeys(self._detector.scenes, _UNLIKELY) | {self.selected: 1.0},
+        )
 
     def _checked(self, vote: object, stamp_ns: int) -> SceneVote:
         """Return a vote at a stamp for a known scene; raises TypeError or ValueError."""
