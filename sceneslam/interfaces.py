@@ -419,6 +419,11 @@ class Steering(Protocol):
 class LiveMapper(Protocol):
     """Builds a map during the run from measurements at the reported poses."""
 
+    @property
+    def sensors(self) -> frozenset[Sensor]:
+        """Return the sensors whose measurements it draws; `add` gets at least one of them."""
+        ...
+
     def open(self, rig: Rig) -> None:
         """Start with an empty map."""
         ...

@@ -11,7 +11,7 @@ from sceneslam.scans.occupancy_grid import OccupancyGrid
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.maps import HybridMap, PointLayer
 from sceneslam.types.observation import Observation
-from sceneslam.types.rig import Rig
+from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.se3 import Transform, apply
 
 _KEY_BITS = 21  # of a voxel's index along each axis
@@ -20,6 +20,8 @@ _UNSEEN_BGR = (160, 160, 160)  # of points without a camera
 
 class GridAndPoints:
     """Adds every observation once; revised poses do not change the map."""
+
+    sensors = frozenset({Sensor.SCAN, Sensor.DEPTH})
 
     def __init__(self, resolution_m: float, voxel_m: float, depth_stride_px: int) -> None:
         if not voxel_m > 0:

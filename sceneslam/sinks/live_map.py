@@ -48,7 +48,9 @@ class LiveMap:
         self._thread.start()
 
     def add(self, observation: Observation, T_map_base: Transform) -> None:
-        """Queue an observation if its pose T_map_base (4, 4) [m] is new."""
+        """Queue an observation that can be drawn, if its pose T_map_base (4, 4) [m] is new."""
+        if not any(observation.has(sensor) for sensor in self._mapper.sensors):
+            return
         if not self._is_new(T_map_base):
             return
         with self._changed:

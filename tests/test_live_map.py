@@ -1,0 +1,76 @@
+"""The map during a run: what is drawn, when, and what happens if drawing fails."""
+
+from threading import Event
+
+import numpy as np
+import pytest
+from fakes import RIG
+
+from sceneslam.sinks.live_map import NOTHING, LiveMap
+from sceneslam.types import se3
+from sceneslam.types.observation import Observation
+from sceneslam.types.rig import Sensor
+
+IMAGE, DEPTH_M = np.zeros((2, 2, 3), np.uint8), np.ones((2, 2), np.float32)
+
+
+class Notes:
+    """A mapper that remembers stamps; below 0 it fails, and the map of an odd one does."""
+
+    sensors = frozenset({Sensor.SCAN, Sensor.DEPTH})
+
+    def __init__(self):
+        self.stamps_ns, self.is_adding, self.may_go_on = [], Event(), Event()
+        self.may_go_on.set()
+
+    def open(self, rig):
+        pass
+
+    def add(self, observation, T_map_base):
+        self.stamps_ns.append(observation.stamp_ns)
+        self.is_adding.set()
+        assert self.may_go_on.wait(10.0)
+        if observation.stamp_ns < 0:
+            raise ValueError("a depth of letters")
+
+    def map(self):
+        if self.stamps_ns[-1] % 2:
+            raise ValueError("no memory for the map")
+        return NOTHING
+
+
+@pytest.fixture
+def mapper():
+    return Notes()
+
+
+@pytest.fixture
+def published():
+    return Event()
+
+
+@pytest.fixture
+def live_map(mapper, published):
+    made = LiveMap(mapper, every_s=0.0, publish=lambda hybrid: published.set())
+    yield made
+    made.close()
+
+
+def add(live_map, stamp_ns, **measured):
+    """Add an observation at a new place."""
+    seen = Observation(stamp_ns=stamp_ns, **measured)
+    live_map.add(seen, se3.from_xy_yaw(float(stamp_ns), 0.0, 0.0))
+
+
+def test_observations_that_cannot_be_drawn_replace_none_that_can(live_map, mapper):
+    live_map.open(RIG)
+    mapper.may_go_on.clear()
+    add(live_map, 2, depth_m=DEPTH_M)
+    assert mapper.is_adding.wait(10.0)
+    add(live_map, 4, image_bgr=IMAGE, depth_m=DEPTH_M)
+    add(live_map, 6, image_bgr=IMAGE)
+    mapper.is_adding.clear()
+    mapper.may_go_on.set()
+    assert mapper.is_adding.wait(10.0)
+    live_map.close()
+    assert mapper.stamps_ns == [2, 4]
