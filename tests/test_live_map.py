@@ -1,6 +1,6 @@
 """The map during a run: what is drawn, when, and what happens if drawing fails."""
 
-from threading import Event
+from threading import Condition, Event
 
 import numpy as np
 import pytest
@@ -74,3 +74,35 @@ def test_observations_that_cannot_be_drawn_replace_none_that_can(live_map, mappe
     assert mapper.is_adding.wait(10.0)
     live_map.close()
     assert mapper.stamps_ns == [2, 4]
+
+
+@pytest.mark.parametrize("fails_at", [-2, 1])
+def test_an_error_of_drawing_costs_one_observation_and_is_raised_at_the_end(
+    live_map, mapper, published, fails_at
+):
+    live_map.open(RIG)
+    add(live_map, fails_at, depth_m=DEPTH_M)
+    assert mapper.is_adding.wait(10.0)
+    add(live_map, 2, depth_m=DEPTH_M)
+    assert published.wait(10.0)
+    with pytest.raises(ValueError, match=r"letters|memory"):
+        live_map.close()
+    live_map.close()
+
+
+def test_a_map_that_does_not_change_is_waited_for_without_a_deadline(live_map, published):
+    waits_s, has_waited = [], Event()
+
+    class Waits(Condition):
+        def wait_for(self, predicate, timeout=None):
+            waits_s.append(timeout)
+            has_waited.set()
+            return super().wait_for(predicate, timeout)
+
+    live_map._changed = Waits()
+    live_map.open(RIG)
+    assert has_waited.wait(10.0) and waits_s[0] is None
+    has_waited.clear()
+    add(live_map, 2, depth_m=DEPTH_M)
+    assert published.wait(10.0) and has_waited.wait(10.0)
+    assert waits_s == [None] * 2

@@ -370,3 +370,10 @@ def test_run_says_over_the_air_what_it_says_in_its_folder(air, tmp_path):
     last = air.last("/sceneslam/path").poses[-1].pose.position
     np.testing.assert_allclose([last.x, last.y], finished.trajectory.positions_m[-1, :2], atol=1e-6)
     assert air.is_closed
+
+
+def test_a_sink_whose_map_failed_leaves_the_network_and_says_so(air, sink):
+    sink._live_map._error = ValueError("a scan of letters")
+    with pytest.raises(ValueError, match="letters"):
+        sink.close()
+    assert air.is_closed

@@ -37,6 +37,7 @@ class LiveMap:
         self._T_map_drawn: Transform | None = None
         self._newest = NOTHING
         self._is_closed = False
+        self._error: Exception | None = None  # the first one
         self._changed = threading.Condition()
         self._thread: threading.Thread | None = None
 
@@ -62,13 +63,16 @@ class LiveMap:
         return self._newest
 
     def close(self) -> None:
-        """Stop the thread. May be called twice."""
+        """Stop the thread; raises the first error of drawing, once. May be called twice."""
         with self._changed:
             self._is_closed = True
             self._changed.notify()
         if self._thread is not None:
             self._thread.join()
             self._thread = None
+        error, self._error = self._error, None
+        if error is not None:
+            raise error
 
     def _is_new(self, T_map_base: Transform) -> bool:
         if self._T_map_drawn is None:
@@ -78,21 +82,24 @@ class LiveMap:
         return way_m > _STEP_M or float(se3.rotation_angle_rad(T_drawn_base)) > _STEP_RAD
 
     def _draw(self) -> None:
-        published_s, is_changed = monotonic() - self._every_s, False
-        try:
-            while True:
-                with self._changed:
-                    self._changed.wait_for(lambda: self._waiting or self._is_closed, self._every_s)
-                    waiting, self._waiting = self._waiting, None
-                if self._is_closed:
-                    return
+        due_s, is_changed = monotonic(), False  # when the map may be published again
+        while True:
+            with self._changed:
+                wait_s = due_s - monotonic() if is_changed else None
+                self._changed.wait_for(lambda: self._waiting or self._is_closed, wait_s)
+                waiting, self._waiting = self._waiting, None
+            if self._is_closed:
+                return
+            try:
                 if waiting is not None:
                     self._mapper.add(*waiting)
                     self._T_map_drawn, is_changed = waiting[1], True
-                if is_changed and monotonic() - published_s >= self._every_s:
-                    published_s, is_changed = monotonic(), False
+                if is_changed and monotonic() >= due_s:
+                    due_s, is_changed = monotonic() + self._every_s, False
                     self._newest = self._mapper.map()
                     self._publish(self._newest)
-        except Exception as error:
-            _log.warning("the live map is no longer updated: %s", text_of(error))
-            _log.debug("the whole error", exc_info=error)
+            except Exception as error:  # the next observation may be drawn
+                _log.debug("the live map", exc_info=error)
+                if self._error is None:
+                    _log.warning("the live map could not be drawn: %s", text_of(error))
+                    self._error = error

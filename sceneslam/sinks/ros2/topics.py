@@ -163,10 +163,12 @@ class TopicSink:
 
     def close(self) -> None:
         """Stop publishing."""
-        self._live_map.close()
-        if self._transport is not None:
-            self._transport.close()
-            self._transport = None
+        try:
+            self._live_map.close()
+        finally:
+            if self._transport is not None:
+                self._transport.close()
+                self._transport = None
 
     def _place(self, T_map_base: Transform) -> None:
         """Move the published `map` so that the robot has the pose of `/initialpose`."""
