@@ -127,7 +127,7 @@ def test_operator_takes_over_from_the_schedule(monkeypatch):
     assert detector.get_scene(Observation(stamp_ns=0)).scene == "Dark"
 
 
-def test_operator_is_heard_by_one_thread_however_often_it_is_activated(monkeypatch):
+def test_operator_is_heard_by_one_thread_for_the_detector_activated_last(monkeypatch):
     reading, writing = os.pipe()
     with os.fdopen(reading) as stdin, os.fdopen(writing, "w") as operator:
         monkeypatch.setattr("sys.stdin", stdin)
@@ -137,7 +137,13 @@ def test_operator_is_heard_by_one_thread_however_often_it_is_activated(monkeypat
             detector.activate(RIG)
             detector.shutdown()
         assert threading.active_count() == before + 1
+        later = Manual(schedule=[[0, "Bright"]], operator=True, scenes=["Dark"])
+        later.activate(RIG)
+        detector.shutdown()
+        operator.write("Dark\n")
         operator.close()
         for thread in threading.enumerate():
             if thread.name == "operator":
                 thread.join(5.0)
+        assert later.get_scene(Observation(stamp_ns=0)).scene == "Dark"
+        assert detector.get_scene(Observation(stamp_ns=0)).scene == "Bright"

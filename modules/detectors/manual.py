@@ -6,6 +6,7 @@ import logging
 import sys
 import threading
 from bisect import bisect_right
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,16 +46,14 @@ class Manual:
         self._names = [str(entry[1]) for entry in schedule]
         self._operator = operator
         self.scenes = tuple(dict.fromkeys([*self._names, *(scenes or [])]))
-        self._thread: threading.Thread | None = None  # waits for standard input until it ends
         self._typed: str | None = None
         self._first_ns: int | None = None
 
     def activate(self, rig: Rig) -> None:
-        """Start the schedule at the next observation; read standard input."""
+        """Start the schedule at the next observation; hear what is typed from now on."""
         self._first_ns, self._typed = None, None
-        if self._operator and self._thread is None:
-            self._thread = threading.Thread(target=self._listen, daemon=True, name="operator")
-            self._thread.start()
+        if self._operator:
+            _keyboard.pass_to(self._hear)
 
     def get_scene(self, observation: Observation) -> SceneVote:
         """Return the scene at the observation's stamp."""
@@ -73,11 +72,40 @@ class Manual:
         return SceneVote(stamp_ns=stamp_ns, scene=scene)
 
     def shutdown(self) -> None:
-        """Do nothing: the reading thread ends with the process."""
+        """Hear no more."""
+        _keyboard.release(self._hear)
 
-    def _listen(self) -> None:
+    def _hear(self, line: str) -> None:
+        if line in self.scenes:
+            self._typed = line
+        elif line:
+            _log.warning("scene: got %r, allowed: %s", line, ", ".join(self.scenes))
+
+
+class _Keyboard:
+    """Standard input, of which a process has one: whoever asked last hears its lines."""
+
+    def __init__(self) -> None:
+        self._hear: Callable[[str], None] | None = None
+        self._thread: threading.Thread | None = None  # waits for a line until the input ends
+
+    def pass_to(self, hear: Callable[[str], None]) -> None:
+        """Call `hear` with each line from now on, in the reading thread."""
+        self._hear = hear
+        if self._thread is None or not self._thread.is_alive():
+            self._thread = threading.Thread(target=self._read, daemon=True, name="operator")
+            self._thread.start()
+
+    def release(self, hear: Callable[[str], None]) -> None:
+        """Call `hear` no more; the thread waits on."""
+        if self._hear == hear:
+            self._hear = None
+
+    def _read(self) -> None:
         for line in sys.stdin:
-            if line.strip() in self.scenes:
-                self._typed = line.strip()
-            elif line.strip():
-                _log.warning("scene: got %r, allowed: %s", line.strip(), ", ".join(self.scenes))
+            hear = self._hear
+            if hear is not None:
+                hear(line.strip())
+
+
+_keyboard = _Keyboard()
