@@ -271,6 +271,13 @@ class FullDisk(IdleSink):
         raise OSError("no space left on device")
 
 
+class DeafSink(IdleSink):
+    """Cannot hear its operator."""
+
+    def commands(self):
+        raise OSError("no such microphone")
+
+
 class ClosedSink(IdleSink):
     """Cannot be opened."""
 

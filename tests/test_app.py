@@ -175,6 +175,12 @@ def test_sink_that_cannot_write_is_left_out_and_named(tmp_path):
     assert len(finished.trajectory) == 100
 
 
+def test_sink_whose_operator_cannot_be_heard_is_left_out_and_named(tmp_path):
+    finished = run(config(sinks={"deaf": {"_target_": "fakes.DeafSink"}}), tmp_path)
+    assert finished.faults == ("sinks.deaf stopped writing: OSError: no such microphone",)
+    assert len(finished.trajectory) == 100
+
+
 def test_folder_holds_the_newest_run_alone(tmp_path):
     run(config(), tmp_path)
     run(config(source__dark_from=1000), tmp_path)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -43,11 +43,16 @@ class OpenSinks:
                 _log.info("sinks.%s", key, exc_info=error)
                 raise InputError(f"sinks.{key} could not be opened: {text_of(error)}") from error
 
-    def commands(self) -> Iterator[Command]:
-        """Yield the operators' commands since the last call."""
-        for sink in list(self._sinks.values()):
-            if isinstance(sink, Steering):
-                yield from sink.commands()
+    def commands(self) -> Sequence[Command]:
+        """Return the operators' commands since the last call."""
+        commands: list[Command] = []
+        for key, sink in list(self._sinks.items()):
+            try:
+                if isinstance(sink, Steering):
+                    commands += sink.commands()
+            except Exception as error:
+                self._drop(key, error)
+        return commands
 
     def write(
         self,
