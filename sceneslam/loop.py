@@ -141,7 +141,8 @@ class RunLoop:
             self.faults.append(f"no ground truth: {text_of(error)}")
 
     def close_sinks(self) -> None:
-        """Pass the final results to the sinks, and close them."""
+        """Pass the last events and the final results to the sinks, and close them."""
+        self._write_events()
         self._sinks.close(self.truth, self.result)
 
     def close(self, *, is_saved: bool) -> None:
@@ -262,6 +263,7 @@ class RunLoop:
         self._steer(observation.stamp_ns)
         watch.lap("operator")
         if self._operator.is_paused:
+            self._write_events()
             return True
         self._bus.step(observation)
         watch.lap("bus")

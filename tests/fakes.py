@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 from dataclasses import replace
@@ -10,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from sceneslam.types import se3
+from sceneslam.types.command import Pause
 from sceneslam.types.errors import InputError
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import (
@@ -269,6 +271,23 @@ class FullDisk(IdleSink):
 
     def write(self, observation, T_map_base, module):
         raise OSError("no space left on device")
+
+
+class PausingSink(IdleSink):
+    """Pauses the run before the third observation, until the sixth; writes down what it hears."""
+
+    def open(self, rig, folder):
+        self._path, self._asked, self._heard = folder / "heard.json", 0, []
+
+    def commands(self):
+        self._asked += 1
+        return {3: [Pause(is_paused=True)], 6: [Pause(is_paused=False)]}.get(self._asked, [])
+
+    def write_event(self, event):
+        self._heard.append({"asked": self._asked, **event})
+
+    def close(self):
+        self._path.write_text(json.dumps(self._heard))
 
 
 class DeafSink(IdleSink):

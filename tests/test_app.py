@@ -181,6 +181,14 @@ def test_sink_whose_operator_cannot_be_heard_is_left_out_and_named(tmp_path):
     assert len(finished.trajectory) == 100
 
 
+def test_events_of_a_pause_and_of_the_end_reach_the_sinks(tmp_path):
+    assert not run(config(sinks={"one": {"_target_": "fakes.PausingSink"}}), tmp_path).faults
+    heard = json.loads((tmp_path / "heard.json").read_text())
+    assert [one.pop("asked") for one in heard if one["event"] == "command"] == [3, 6]
+    logged = [json.loads(line) for line in (tmp_path / "events.jsonl").read_text().splitlines()]
+    assert [one["event"] for one in heard] == [one["event"] for one in logged]
+
+
 def test_folder_holds_the_newest_run_alone(tmp_path):
     run(config(), tmp_path)
     run(config(source__dark_from=1000), tmp_path)
