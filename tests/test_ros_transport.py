@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 import socket
+import sys
 import threading
 from contextlib import contextmanager
 from pathlib import Path
+from unittest.mock import MagicMock, patch
 
 import pytest
 
@@ -159,3 +161,27 @@ def test_environment_names_domain_and_range(monkeypatch):
     assert Network().reach() == LOCALHOST
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET")
     assert Network().reach() == SUBNET and Network(discovery=LOCALHOST).reach() == LOCALHOST
+
+
+@pytest.mark.parametrize(
+    ("discovery", "before", "wanted"),
+    [
+        (None, None, "LOCALHOST"),
+        (None, "SUBNET", "SUBNET"),
+        (LOCALHOST, "SUBNET", "LOCALHOST"),
+        (SUBNET, "LOCALHOST", "SUBNET"),
+    ],
+)
+def test_rclpy_reads_the_range_of_its_run_alone(monkeypatch, discovery, before, wanted):
+    """With a stand-in for rclpy: where it is installed, only its discovery would show the range."""
+    name, found = "ROS_AUTOMATIC_DISCOVERY_RANGE", []
+    monkeypatch.setenv(name, before or "")
+    if before is None:
+        monkeypatch.delenv(name)
+    parts = ("rclpy", "rclpy.context", "rclpy.executors", "rclpy.node", "rclpy.qos")
+    stand_in = {part: MagicMock() for part in parts}
+    stand_in["rclpy"].init = lambda **_: found.append(os.environ.get(name))
+    with patch.dict(sys.modules, stand_in):
+        sys.modules.pop("sceneslam.ros.transport.rclpy_node", None)
+        open_transport(Network(transport="rclpy", domain_id=0, discovery=discovery)).close()
+    assert found == [wanted] and os.environ.get(name) == before

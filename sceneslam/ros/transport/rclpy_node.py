@@ -6,7 +6,8 @@ import importlib
 import logging
 import os
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from time import monotonic_ns
 from typing import Any
 
@@ -30,17 +31,18 @@ from sceneslam.types.errors import ConfigError, text_of
 
 _log = logging.getLogger(__name__)
 _SPIN_S = 0.1
+_RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
+_environment = threading.Lock()
 
 
 class RclpyTransport:
     """The node `sceneslam`; messages are not deserialised (raw subscriptions)."""
 
     def __init__(self, network: Network) -> None:
-        if network.reach() == LOCALHOST:  # rclpy reads it from the environment only
-            os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
         self._context = Context()
-        rclpy.init(context=self._context, domain_id=network.domain())
-        self._node = Node("sceneslam", context=self._context)
+        with _discovering(network.discovery):
+            rclpy.init(context=self._context, domain_id=network.domain())
+            self._node = Node("sceneslam", context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
         self._publishers: dict[str, _Publisher] = {}
@@ -107,6 +109,20 @@ class RclpyTransport:
     def _spin(self) -> None:
         while not self._is_closed:
             self._executor.spin_once(timeout_sec=_SPIN_S)
+
+
+@contextmanager
+def _discovering(discovery: str | None) -> Iterator[None]:
+    """Set the range that a context joined within reads from the environment, and only there."""
+    with _environment:
+        before = os.environ.get(_RANGE)
+        os.environ[_RANGE] = (discovery or before or LOCALHOST).upper()
+        try:
+            yield
+        finally:
+            del os.environ[_RANGE]
+            if before is not None:
+                os.environ[_RANGE] = before
 
 
 class _Publisher:
