@@ -14,7 +14,6 @@ from sceneslam.atlas.lasting.merge import side_by_side
 from sceneslam.atlas.lasting.prune import prune
 from sceneslam.atlas.lasting.saved_map import SavedMap, empty_map
 from sceneslam.atlas.pose_path import trajectory_of
-from sceneslam.atlas.rows import Rows
 from sceneslam.atlas.submaps.correction import Correction
 from sceneslam.atlas.submaps.graph import consistent, on_floor
 from sceneslam.atlas.submaps.own_loops import closed_loops
@@ -23,6 +22,7 @@ from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.types import planar, se3
 from sceneslam.types.maps import GridLayer, MapLayers, PointLayer, PoseGraphLayer
 from sceneslam.types.observation import Observation
+from sceneslam.types.rows import Rows
 
 # Loops.
 

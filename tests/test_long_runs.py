@@ -8,12 +8,12 @@ import pytest
 from sceneslam.atlas.atlas import Atlas
 from sceneslam.atlas.budget import Budget, thin
 from sceneslam.atlas.pose_path import OpenSession
-from sceneslam.atlas.rows import Rows
 from sceneslam.engine.slowest import Slowest
 from sceneslam.storage.events import EventLog
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.maps import LandmarkLayer, MapLayers, PointLayer, ScanLayer
+from sceneslam.types.rows import Rows
 from sceneslam.types.run import SlowPose
 from sceneslam.types.trajectory import Trajectory
 

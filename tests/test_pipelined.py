@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import weakref
+
 import numpy as np
 import pytest
 from fakes import PERIOD_NS, RIG, observation, true_pose
@@ -156,6 +158,18 @@ def said(answers):
             pipeline.take([Tracking(stamp_ns=seen.stamp_ns, **given | answers[index])])
         found.append(pipeline.report(seen))
     return found
+
+
+def test_answers_are_kept_as_numbers_not_as_objects():
+    pipeline, kept = Pipeline(late_max_s=1.0), []
+    for index in range(5):
+        pipeline.note(observation(index))
+        T_local_base = true_pose(index * PERIOD_NS)
+        kept.append(weakref.ref(T_local_base))
+        status = TrackingStatus.TRACKING
+        stamp_ns = index * PERIOD_NS
+        pipeline.take([Tracking(stamp_ns=stamp_ns, T_local_base=T_local_base, status=status)])
+    assert [one() is None for one in kept] == [True] * 4 + [False]
 
 
 def test_the_drift_of_a_systems_map_is_that_of_its_newest_answer():

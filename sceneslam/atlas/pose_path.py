@@ -10,12 +10,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.atlas.rows import Rows
 from sceneslam.atlas.submaps.collector import Known
 from sceneslam.atlas.uncertainty import Covariance
 from sceneslam.types import se3
 from sceneslam.types.covariance import TRIANGLE, semidefinite, symmetric, triangle
 from sceneslam.types.maps import MapLayers
+from sceneslam.types.rows import Rows
 from sceneslam.types.run import BRIDGED, SessionStart
 from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import Trajectory

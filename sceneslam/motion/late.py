@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Sequence
 
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
+from sceneslam.types.rows import Rows
 from sceneslam.types.trajectory import Trajectory
 
 
@@ -29,8 +31,7 @@ class Pipeline:
         self._first_ns: int | None = None
         self._T_local_base = se3.identity()  # the last reported pose
         self._twist_s = np.zeros(6)
-        self._stamps_ns: list[int] = []
-        self._poses: list[se3.Transform] = []
+        self._stamps_ns, self._poses = array("q"), Rows(4, 4)  # T_local_base, as it was answered
 
     def note(self, observation: Observation) -> None:
         """Record an observation that was given to the program."""
@@ -89,7 +90,7 @@ class Pipeline:
         if not self._is_late or not self._stamps_ns:
             return Trajectory.empty()
         return Trajectory(
-            stamps_ns=np.array(self._stamps_ns, np.int64), T_world_base=np.stack(self._poses)
+            stamps_ns=np.array(self._stamps_ns, np.int64), T_world_base=np.asarray(self._poses)
         )
 
     def _carry_on(self, observation: Observation) -> TrackingStatus:
