@@ -147,11 +147,11 @@ def test_system_of_another_kind_is_refused():
         Pipelined("my_slam.MyPipeline", 0.5)
 
 
-def said(answers):
+def said(answers, *, has_odometry=True):
     """Return what a system that says `answers` (index of observation -> fields) is taken to say."""
     pipeline, found = Pipeline(late_max_s=1.0), []
     for index in range(6):
-        seen = observation(index)
+        seen = observation(index, has_odometry=has_odometry)
         pipeline.note(seen)
         if index in answers:
             given = {"T_local_base": true_pose(seen.stamp_ns), "status": TrackingStatus.TRACKING}
@@ -170,6 +170,14 @@ def test_answers_are_kept_as_numbers_not_as_objects():
         stamp_ns = index * PERIOD_NS
         pipeline.take([Tracking(stamp_ns=stamp_ns, T_local_base=T_local_base, status=status)])
     assert [one() is None for one in kept] == [True] * 4 + [False]
+
+
+def test_a_correction_of_the_map_is_no_velocity():
+    T_new_old = se3.from_xy_yaw(1.0, 0.0, 0.0)
+    moved = {"T_local_base": T_new_old @ true_pose(2 * PERIOD_NS), "revision": 1}
+    answers = said({0: {}, 1: {}, 2: moved}, has_odometry=False)
+    expected = T_new_old @ true_pose(3 * PERIOD_NS)
+    np.testing.assert_allclose(answers[3].T_local_base, expected, atol=1e-9)
 
 
 def test_the_drift_of_a_systems_map_is_that_of_its_newest_answer():

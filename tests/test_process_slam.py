@@ -243,6 +243,23 @@ def test_late_poses_are_carried_on_by_odometry_until_they_come(started):
     assert len(module.get_trajectory().stamps_ns) == 12
 
 
+def test_a_program_that_corrects_its_map_did_not_move(started):
+    module, T_new_old = echo(started), se3.from_xy_yaw(1.0, 0.0, 0.0)
+    for index in range(4):
+        seen = observation(index, has_odometry=False)
+        module._pipeline.note(seen)
+        if index < 3:
+            T = true_pose(seen.stamp_ns)
+            reply = {
+                "stamps_ns": np.array([seen.stamp_ns]),
+                "T_local_base": (T_new_old @ T if index == 2 else T)[None],
+                "revision": np.array(index // 2),
+            }
+            module._take(reply)
+    T_local_base = module._pipeline.report(seen).T_local_base
+    np.testing.assert_allclose(T_local_base, T_new_old @ true_pose(seen.stamp_ns), atol=1e-9)
+
+
 def test_poses_that_are_too_late_are_lost(started):
     module = echo(started, late=100, late_max_s=0.5)
     statuses = [module.track(observation(index)).status for index in range(10)]

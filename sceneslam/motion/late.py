@@ -30,7 +30,7 @@ class Pipeline:
         self._T_odom_newest: se3.Transform | None = None
         self._first_ns: int | None = None
         self._T_local_base = se3.identity()  # the last reported pose
-        self._twist_s = np.zeros(6)
+        self._twist_s, self._kept_revision = np.zeros(6), 0
         self._stamps_ns, self._poses = array("q"), Rows(4, 4)  # T_local_base, as it was answered
 
     def note(self, observation: Observation) -> None:
@@ -41,7 +41,10 @@ class Pipeline:
             self._first_ns, self._T_odom_newest = observation.stamp_ns, T_odom_base
 
     def take(self, answers: Sequence[Tracking]) -> None:
-        """Add answers by increasing stamp; raises ValueError for an unexpected one."""
+        """Add answers by increasing stamp; raises ValueError for an unexpected one.
+
+        Between answers of different revisions the map moved, not the robot.
+        """
         for answer in answers:
             if answer.stamp_ns not in self._waiting:
                 given = f"the last was {max(self._waiting, default=None)}"
@@ -112,9 +115,10 @@ class Pipeline:
         return TrackingStatus.DEGRADED
 
     def _keep(self, answer: Tracking) -> None:
-        if self._poses:
+        if self._poses and answer.revision == self._kept_revision:
             T_prev_curr = se3.inverse(self._poses[-1]) @ answer.T_local_base
             gap_s = (answer.stamp_ns - self._stamps_ns[-1]) * 1e-9
             self._twist_s = se3.log(T_prev_curr) / gap_s
         self._stamps_ns.append(answer.stamp_ns)
         self._poses.append(answer.T_local_base)
+        self._kept_revision = answer.revision

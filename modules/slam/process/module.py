@@ -6,6 +6,7 @@ import json
 import shutil
 import sys
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from time import monotonic
 from typing import Any, TypeVar
 
@@ -198,6 +199,6 @@ class ProcessSlam(LocalModule, Restarted[Program]):
             raise self._own_program().refuse(str(error)) from error
 
     def _take(self, reply: Fields) -> None:
-        self._pipeline.take(answers(reply))
         revision: Any = reply.get("revision", self._pipeline.revision)
+        self._pipeline.take([replace(one, revision=int(revision)) for one in answers(reply)])
         self._pipeline.revision = int(revision)
