@@ -188,6 +188,17 @@ def test_the_drift_of_a_systems_map_is_that_of_its_newest_answer():
     np.testing.assert_allclose(answers[3].map_covariance, se3.carried(2.0 * np.eye(6), T))
 
 
+def test_a_pose_that_is_carried_on_is_as_certain_as_the_newest_answer():
+    given, lost = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]), {"status": TrackingStatus.LOST}
+    answers = said({0: {"covariance": np.eye(6)}, 1: {"covariance": given}, 4: lost})
+    assert answers[1].covariance is given
+    for answer in answers[2:4]:
+        T = se3.inverse(answer.T_local_base) @ answers[1].T_local_base
+        np.testing.assert_allclose(answer.covariance, se3.carried(given, T))
+    assert answers[4].covariance is None and answers[5].covariance is None
+    assert all(answer.covariance is None for answer in said({0: {}})[1:])
+
+
 def test_a_system_may_begin_anew_only_where_it_says_that_it_is_lost():
     lost = {"status": TrackingStatus.LOST, "can_begin": True}
     assert [answer.can_begin for answer in said({0: {}, 2: lost})] == [0, 0, 1, 1, 1, 1]

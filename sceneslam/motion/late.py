@@ -69,24 +69,26 @@ class Pipeline:
             status, self._T_local_base = exact.status, exact.T_local_base
         else:
             status = self._carry_on(observation)
+        is_tracked = status is not TrackingStatus.LOST
+        reported = newest.covariance if newest is not None and is_tracked else None
         return Tracking(
             stamp_ns=observation.stamp_ns,
             T_local_base=self._T_local_base.copy(),
             status=status,
-            covariance=None if exact is None else exact.covariance,
-            map_covariance=None if newest is None or is_lost else self._drift(newest),
+            covariance=reported if exact is not None else self._here(reported),
+            map_covariance=self._here(None if newest is None or is_lost else newest.map_covariance),
             quality_ratio=newest.quality_ratio if newest is not None else 0.0,
             inliers=newest.inliers if newest is not None else 0,
             revision=self.revision,
             can_begin=newest is not None and is_lost and newest.can_begin,
         )
 
-    def _drift(self, newest: Tracking) -> NDArray[np.float64] | None:
-        """Return the map's covariance (6, 6) of the newest answer, in the axes of the pose now."""
-        if newest.map_covariance is None:
+    def _here(self, covariance: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
+        """Return a covariance (6, 6) of the newest answer, in the axes of the pose now."""
+        if covariance is None or self._newest is None:
             return None
-        T_now_newest = se3.inverse(self._T_local_base) @ newest.T_local_base
-        return se3.carried(newest.map_covariance, T_now_newest)
+        T_now_newest = se3.inverse(self._T_local_base) @ self._newest.T_local_base
+        return se3.carried(covariance, T_now_newest)
 
     def trajectory(self) -> Trajectory:
         """Return T_local_base as the program gave it; empty if no answer was late."""
