@@ -1,5 +1,7 @@
 """Alignment of colours and depth of two cameras, and constraints between keyframes by depth."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from rgbd_features import features_at, random_descriptors
@@ -137,9 +139,32 @@ def test_a_search_that_finds_nothing_does_not_keep_all_images():
                 bundle=bundle,
                 keyframe_ids=ids,
                 free_ids=ids[:0],
+                map_ids=frozenset(ids),
                 fresh={ids[-1]: shown},
                 by_odometry=[],
             )
         )
     assert not work._search.is_over
     assert len(work._searched) == 60  # those that can still be registered
+
+
+def test_constraints_of_keyframes_that_left_the_map_are_forgotten():
+    rng = np.random.default_rng(0)
+    work, bundle = MappingWork(CAMERA, CAMERA, Alignment()), exact_bundle(rng)
+    bundle = replace(bundle, T_local_cam=np.repeat(bundle.T_local_cam[:1], 5, axis=0))
+    shown = Shown(
+        features=features_at(np.zeros((1, 2)), random_descriptors(rng, 1)),
+        depth_m=depth_image(np.eye(4)),
+    )
+    for ids in ([0, 1, 2, 3, 4], [0, 1, 3, 4, 5]):
+        work(
+            Task(
+                bundle=bundle,
+                keyframe_ids=ids,
+                free_ids=ids[-3:],
+                map_ids=frozenset(ids),
+                fresh=dict.fromkeys(ids[-3:], shown),
+                by_odometry=[],
+            )
+        )
+    assert set(work._constraints) == {(3, 4), (3, 5), (4, 5)}

@@ -21,6 +21,7 @@ class Task:
     bundle: Bundle
     keyframe_ids: list[int]  # (K,) of the bundle's keyframes, ascending
     free_ids: list[int]
+    map_ids: frozenset[int]  # of all keyframes in the map; a removed one does not come back
     fresh: Mapping[int, Shown]  # views of new keyframes, by id
     by_odometry: Sequence[tuple[tuple[int, int], PoseConstraint]]  # by keyframe ids
 
@@ -64,7 +65,12 @@ class MappingWork:
         )
 
     def _tie(self, task: Task) -> None:
-        """Register the new keyframes with the free ones before them."""
+        """Register the new keyframes with the free ones before them; forget removed ones."""
+        self._constraints = {
+            pair: constraint
+            for pair, constraint in self._constraints.items()
+            if task.map_ids.issuperset(pair)
+        }
         for keyframe_id, shown in task.fresh.items():
             self._depth_constraints.look(keyframe_id, shown.depth_m)
             if not self._search.is_over:

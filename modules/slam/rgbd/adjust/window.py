@@ -82,6 +82,7 @@ def take_window(
         bundle=bundle,
         keyframe_ids=keyframe_ids,
         free_ids=free,
+        map_ids=frozenset(store.ids),
         fresh=fresh,
         by_odometry=odometry_constraints(
             dict(zip(keyframe_ids, keyframes, strict=True)), visual_map.camera.T_base_cam
