@@ -1,6 +1,7 @@
 """What the bus accepts of a module's answers, up to the limits."""
 
 from dataclasses import replace
+from unittest.mock import Mock
 
 import hostile
 import numpy as np
@@ -10,6 +11,7 @@ from fakes import ExactModule, observation
 from sceneslam.atlas.fusion import Placed, fuse
 from sceneslam.atlas.save import save_points
 from sceneslam.bus.judging.answers import checked_layers, checked_tracking, checked_trajectory
+from sceneslam.storage.journal import Journal, JournalHeader, read_journal
 from sceneslam.types import se3
 from sceneslam.types.maps import (
     LAYER_TYPES,
@@ -93,6 +95,20 @@ def test_stamps_of_a_trajectory_increase():
     assert len(checked_trajectory(Trajectory(stamps_ns=np.arange(3), T_world_base=poses))) == 3
     with pytest.raises(ValueError, match="rising"):
         checked_trajectory(Trajectory(stamps_ns=np.array([1, 2, 2]), T_world_base=poses))
+
+
+def test_a_trajectory_of_narrow_numbers_is_kept_as_the_journal_is_read(tmp_path):
+    poses = np.tile(np.eye(4, dtype=np.float32), (3, 1, 1))
+    given = Trajectory(stamps_ns=np.arange(3, dtype=np.int32), T_world_base=poses)
+    head = JournalHeader(title="", value_label="", has_odometry=False, began_in="/")
+    journal = Journal(tmp_path / "journal.bin", head)
+    journal.add_end(0, checked_trajectory(given))
+    journal.close()
+    log = Mock()
+    read_journal(tmp_path / "journal.bin", log)
+    revised = log.add_end.call_args.args[1]
+    np.testing.assert_array_equal(revised.stamps_ns, given.stamps_ns)
+    np.testing.assert_array_equal(revised.T_world_base, given.T_world_base)
 
 
 POSES = np.tile(np.eye(4), (2, 1, 1))

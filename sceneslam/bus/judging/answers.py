@@ -65,7 +65,7 @@ def checked_tracking(tracking: object, stamp_ns: int) -> Tracking:
 
 
 def checked_trajectory(trajectory: object) -> Trajectory:
-    """Return a trajectory whose stamps increase."""
+    """Return a trajectory whose stamps increase, with copies of its arrays: int64 and float64."""
     trajectory = _of("get_trajectory's answer", trajectory, Trajectory)
     stamps_ns = _of("stamps_ns", trajectory.stamps_ns, np.ndarray)
     if stamps_ns.dtype.kind != "i" or (np.diff(stamps_ns) <= 0).any():
@@ -74,7 +74,9 @@ def checked_trajectory(trajectory: object) -> Trajectory:
     T_world_base = _of("T_world_base", trajectory.T_world_base, np.ndarray)
     _check_shape("T_world_base", T_world_base, (len(stamps_ns), 4, 4))
     _check_rigid("T_world_base", T_world_base)
-    return trajectory
+    return Trajectory(
+        stamps_ns=stamps_ns.astype(np.int64), T_world_base=T_world_base.astype(np.float64)
+    )
 
 
 def checked_layers(layers: object) -> MapLayers:
