@@ -249,6 +249,19 @@ def test_a_journal_read_up_to_any_byte_is_the_beginning_of_what_was_told(tmp_pat
     assert counts == sorted(counts) and 1 <= counts[-1] - counts[0] <= 3
 
 
+def test_a_record_that_cannot_be_read_costs_no_other(tmp_path):
+    """Poses of 32 bits, as a module revised them at its end."""
+    journal = Journal(tmp_path / "journal.bin", HEAD)
+    told_atlas(journal, 0)
+    poses = np.tile(np.eye(4, dtype=np.float32), (5, 1, 1))
+    journal.add_end(0, Trajectory(stamps_ns=np.arange(5), T_world_base=poses))
+    journal.add_observation(3000)
+    journal.close()
+    kept = read_journal(tmp_path / "journal.bin", _Retold(Atlas(voxel_m=0.1)))
+    assert kept.observed_ns.tolist() == list(range(0, 3010, 10))
+    assert kept.torn_bytes == 9 + 8 + 5 * (8 + 12 * 4)
+
+
 def test_a_journal_takes_at_most_450_bytes_a_pose(tmp_path):
     journal = Journal(tmp_path / "journal.bin", HEAD)
     for stamp_ns in range(1000):

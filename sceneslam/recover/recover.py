@@ -60,7 +60,7 @@ def recover(folder: Path) -> Recovered:
     kept = read_journal(folder / JOURNAL, _Retold(atlas))
     missing = list(_NEVER_KEPT)
     if kept.torn_bytes:
-        missing.append(f"the last {kept.torn_bytes} bytes of {JOURNAL}, which are torn")
+        missing.append(f"{kept.torn_bytes} bytes of {JOURNAL}, which are torn")
     events = _events(folder, missing)
     with chdir(kept.head.began_in) if Path(kept.head.began_in).is_dir() else nullcontext():
         source, truth = _source(config, builder, missing)

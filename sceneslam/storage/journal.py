@@ -25,6 +25,7 @@ import json
 import struct
 import zlib
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -147,26 +148,27 @@ class Kept:
 
     head: JournalHeader
     observed_ns: NDArray[np.int64]
-    torn_bytes: int  # bytes after the last complete record
+    torn_bytes: int  # bytes that are no complete record, or none that can be read
 
 
 def read_journal(path: Path, log: TrajectoryLog) -> Kept:
     """Repeat the journal's calls on `log`, up to the last complete record.
 
-    Raises InputError for a file that is not a journal.
+    A record that cannot be read is left out. Raises InputError for a file that is not a journal.
     """
     data = path.read_bytes()
     if not data.startswith(MAGIC):
         raise InputError(f"not a journal of this version: {path}")
     head, observed_ns, read = None, [], len(MAGIC)
     for kind, body in _records(data):
-        read += _HEAD.size + len(body)
-        if kind == b"H":
-            head = JournalHeader(**json.loads(body))
-        elif kind == b"O":
-            observed_ns.append(_number(body))
-        else:
-            _TELL[kind](log, body)
+        with suppress(ValueError):
+            if kind == b"H":
+                head = JournalHeader(**json.loads(body))
+            elif kind == b"O":
+                observed_ns.append(_number(body))
+            else:
+                _TELL[kind](log, body)
+            read += _HEAD.size + len(body)
     if head is None:
         raise InputError(f"the journal ends within its first record: {path}")
     stamps_ns = np.array(observed_ns, np.int64)
