@@ -45,11 +45,11 @@ def test_a_lost_module_is_replaced_when_the_patience_is_over(is_blind, patience_
     assert (verdict.action, verdict.to, verdict.reason) == (Action.SWITCH, ("b", "c"), "lost")
 
 
-@pytest.mark.parametrize("rounds", [0, 1, 2])
-def test_all_modules_are_tried_again_after_a_window_that_doubles(rounds):
+@pytest.mark.parametrize(("rounds", "window_s"), list(enumerate([2, 4, 8, 16, 16])))
+def test_all_modules_are_tried_again_after_a_window_that_doubles_three_times(rounds, window_s):
     changes = {"tried": frozenset("abc"), "rounds": rounds}
-    assert decided((2 * S << rounds) - 1, **changes).action is Action.GO_ON
-    verdict = decided(2 * S << rounds, **changes)
+    assert decided(window_s * S - 1, **changes).action is Action.GO_ON
+    verdict = decided(window_s * S, **changes)
     assert (verdict.to, verdict.rounds) == (("b", "c"), rounds + 1)
 
 

@@ -257,6 +257,16 @@ def test_vain_trials_become_rare():
     assert bright.activations <= 14  # 1 + after 1, 2, 4, and then every 8 s, each given 1 s
 
 
+def test_modules_that_are_all_lost_are_tried_at_a_steady_pace_in_the_end():
+    lost = range(50, 5000)
+    modules = {"bright": ExactModule(lost=lost), "dark": ExactModule(lost=lost)}
+    options = {"handover": "rewind", "confirm_window_s": 0.5, "retry_s": 1.0, "buffer_s": 3.0}
+    _, _, log, _ = drive(modules, steps=600, **options)
+    waits_s = np.diff([one["stamp_ns"] / 1e9 for one in events(log, "decision")[1:]])
+    np.testing.assert_allclose(waits_s, [0.5, 1.0, 2.0, *[4.0] * (len(waits_s) - 3)])
+    assert len(waits_s) > 10
+
+
 def test_trial_ends_where_the_fallback_becomes_the_first_choice():
     modules = {"bright": ExactModule(lost=range(30, 60)), "dark": ExactModule()}
     table = {"Bright": ["bright", "dark"], "Dark": ["dark"]}

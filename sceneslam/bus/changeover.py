@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
-from sceneslam.bus.decision import Decision, Situation, StandbyTrial
+from sceneslam.bus.decision import DOUBLINGS, Decision, Situation, StandbyTrial
 from sceneslam.bus.estimator import Estimator
 from sceneslam.bus.handover import Handover
 from sceneslam.bus.judging.hold import Health
@@ -18,7 +18,6 @@ from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig
 
 _TRIAL_NS = 1_000_000_000  # the first choice tracks this long on standby before it takes over again
-_DOUBLINGS = 3  # of the time until the first choice is tried again: from `retry_s` of 2 s to 16 s
 
 
 class Outcome(Enum):
@@ -77,7 +76,7 @@ class Candidates:
         """
         if is_in_vain is not None:
             self._retries = self._retries + 1 if is_in_vain else 0
-        self.retry_ns = stamp_ns + (self._retry_ns << min(self._retries, _DOUBLINGS))
+        self.retry_ns = stamp_ns + (self._retry_ns << min(self._retries, DOUBLINGS))
 
 
 @dataclass(slots=True, kw_only=True)

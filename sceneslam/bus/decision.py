@@ -64,6 +64,7 @@ class Decision:
     rounds: int = 0  # the new count of rounds in which all choices failed
 
 
+DOUBLINGS = 3  # of a wait after a failure, at most: from 2 s to 16 s
 _BLIND = 0.1  # share of the patience: constant velocity errs more than ten times as much as wheels
 GO_ON = Decision(action=Action.GO_ON)
 
@@ -96,8 +97,8 @@ def _decide_on_loss(policy: Policy, now: Situation) -> Decision:
 
     Modules that were tried may be tried again in two cases: the active one had tracked for a
     window before it was lost, or no other module is left and it has been lost for a window. The
-    window doubles each time, so that modules do not alternate. A module that sees enough, and for
-    long nothing of its map, begins anew where no other takes over.
+    window doubles with each round, `DOUBLINGS` times at most, so that modules do not alternate. A
+    module that sees enough, and for long nothing of its map, begins anew where no other takes over.
     """
     lost_ns = now.stamp_ns - now.unheld_since_ns
     window_ns = round(policy.confirm_window_s * 1e9)
@@ -108,7 +109,7 @@ def _decide_on_loss(policy: Policy, now: Situation) -> Decision:
     left, rounds = tuple(key for key in others if key not in now.tried), now.rounds
     if now.held_ns >= window_ns or (now.health is Health.FAILED and not left):
         left, rounds = others, 0
-    elif not left and lost_ns >= window_ns << now.rounds:
+    elif not left and lost_ns >= window_ns << min(now.rounds, DOUBLINGS):
         left, rounds = others, now.rounds + 1
     if _is_adrift(policy, now):
         left = (*left, now.active)  # anew, with an empty map

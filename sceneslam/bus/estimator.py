@@ -99,8 +99,9 @@ class Estimator:
         """Make a module that has caught up the active one, and shut the old one down."""
         old, self.session = self.session, handover.session
         self.session.bridge, self.session.from_ns = old.bridge, handover.anchor.stamp_ns
-        if self.session.hold.adrift_since_ns is not None:  # what it caught up on does not count
-            self.session.hold.adrift_since_ns = self.now_ns
+        hold = self.session.hold  # what it was lost for in what it caught up on does not count
+        hold.unheld_since_ns = None if hold.unheld_since_ns is None else self.now_ns
+        hold.adrift_since_ns = None if hold.adrift_since_ns is None else self.now_ns
         if self.session.is_placed:
             self._rewrite(handover)
         self._tell(self.now_ns)
