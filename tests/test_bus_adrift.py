@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from driving import drive, events, policy
+from driving import GATE, drive, events, policy
 from fakes import PERIOD_NS, ExactModule, observation, true_pose
 from test_bus_decisions import NOW_NS, S, situation
 
@@ -139,6 +139,26 @@ def test_it_gets_as_long_to_find_itself_as_a_first_choice_that_is_tried_again():
 @pytest.mark.parametrize("health", [Health.SUSPECT, Health.SILENT])
 def test_only_a_module_that_says_it_is_lost_begins_anew(health):
     assert adrift(9 * S, health=health).action is Action.GO_ON
+
+
+def test_a_module_that_was_suspect_before_it_was_lost_begins_anew():
+    class Jumping(ExactModule):
+        """Is off by a metre at one index, and lost from the next on."""
+
+        def track(self, observation):
+            index = observation.stamp_ns // PERIOD_NS
+            if self.activations == 1 and index > FIRST:
+                self.lost.add(index)
+            answer = replace(super().track(observation), can_begin=True)
+            self.lost.clear()
+            shift = se3.from_xy_yaw(float(index == FIRST), 0.0, 0.0)
+            return replace(answer, T_local_base=shift @ answer.T_local_base)
+
+    module = Jumping()
+    _, atlas, log, _ = carried(module, feed=observation, gate=GATE)
+    assert len(events(log, "suspect")) == 1 and module.activations == 2
+    assert events(log, "decision")[-1]["stamp_ns"] == (FIRST + 1) * PERIOD_NS + 2 * S
+    assert atlas.pose_modules[-1] == "bright"
 
 
 def test_status_of_a_module_that_begins_anew_is_logged():

@@ -67,7 +67,7 @@ class Hold:
         """Return the module's health."""
         if self.unheld_since_ns is None:
             return Health.HELD
-        if self.is_suspect:
+        if self.is_suspect and self.adrift_since_ns is None:
             return Health.SUSPECT
         return Health.LOST if self.status is TrackingStatus.LOST else Health.SILENT
 
