@@ -64,6 +64,24 @@ def test_fallback_comes_at_once_where_no_wheels_bridge(wheels):
     assert_exact(atlas)
 
 
+def test_wheels_that_lied_bridge_again_some_seconds_after_the_module_was_lost():
+    class Certain(ExactModule):
+        def track(self, observation):
+            return replace(super().track(observation), covariance=1e-6 * np.eye(6))
+
+    def feed(index):
+        slipped = true_pose((index + 10 * (index >= 40)) * PERIOD_NS)
+        return replace(observation(index), T_odom_base=slipped)
+
+    module = Certain(lost=range(45, 1000))
+    table = {"Bright": ["bright"]}
+    _, atlas, log, _ = drive({"bright": module}, feed=feed, gate=GATE, table=table, steps=150)
+    told = [(one["stamp_ns"] // PERIOD_NS, one["is_believed"]) for one in events(log, "odometry")]
+    assert told == [(40, False), (95, True)]
+    indices = (atlas.trajectory.stamps_ns // PERIOD_NS).tolist()
+    assert indices[44:] == [44, *range(95, 150)]
+
+
 def test_sensor_that_falls_silent_calls_in_the_fallback():
     def feed(index):
         return observation(index) if index < 50 else replace(observation(index), image_bgr=None)

@@ -235,6 +235,12 @@ def test_a_small_jump_is_not_held_against_a_module_while_the_wheels_reverse():
     assert all(trusted(judgements)[10:]) and judgements[-1].wheels_lie
 
 
+def test_what_was_found_of_the_wheels_stands_for_a_horizon_after_the_module_was_lost():
+    module = lost_between(arc, 55, 200)
+    lies = [one.wheels_lie for one in witnessed(module, odometry=frozen(40, 60), steps=200)]
+    assert all(lies[54 : 54 + 51]) and not any(lies[54 + 51 :])
+
+
 def test_a_long_slip_of_the_wheels_is_not_held_against_a_module_that_jumps_later():
     judgements = witnessed(jumping(280, 0.3), odometry=frozen(40, 250), steps=320)
     assert judgements[249].wheels_lie and not judgements[270].wheels_lie

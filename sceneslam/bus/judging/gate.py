@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -156,7 +156,10 @@ class Gate:
             self._way_m += _norm(T_odom_base[:3, 3] - T_odom_prev[:3, 3])
             self._turn_rad += _angle_rad(T_odom_base[:3, :3] - T_odom_prev[:3, :3])
         if T_local_base is None:
-            return Judgement(is_trusted=False)
+            lie = self._unchecked.wheels_lie
+            lie = lie and stamp_ns - self._samples[-1].stamp_ns <= _HORIZONS_NS[-1]
+            self._unchecked = replace(self._unchecked, wheels_lie=lie)
+            return Judgement(is_trusted=False, wheels_lie=lie)
         if self._is_revised and self._samples:
             self._move_past(self._samples[-1], T_local_base, T_odom_base)
         self._is_revised = False

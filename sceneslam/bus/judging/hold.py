@@ -149,8 +149,7 @@ class Hold:
             witness=witness,
         )
         self.agrees = judgement.is_trusted and judgement.turn_agrees
-        if T_local_base is not None:
-            self.wheels_lie, self.wheels_jumped = judgement.wheels_lie, judgement.wheels_jumped
+        self.wheels_lie, self.wheels_jumped = judgement.wheels_lie, judgement.wheels_jumped
         if judgement.is_wrong:
             self.suspect_since_ns = None if self.is_suspect else judgement.since_ns
             self.is_suspect = True
