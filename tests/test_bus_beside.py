@@ -156,6 +156,39 @@ def test_trial_that_cannot_start_is_logged_and_delays_the_next():
     ]
 
 
+def test_trial_has_its_time_to_see_motion_after_a_slow_start():
+    """It takes longer than `retry_s` to start, and then needs ten images."""
+    answered, may_start, has_started, dark = [], Event(), Event(), Slow()
+
+    class SlowAgain(ExactModule):
+        def activate(self, rig):
+            if self.activations:
+                assert may_start.wait(10.0)
+            super().activate(rig)
+            if self.activations > 1:
+                has_started.set()
+
+        def track(self, observation):
+            if self.activations > 1:
+                answered.append(observation.stamp_ns)
+                if len(answered) > 10:
+                    self.lost.clear()
+            return super().track(observation)
+
+    def feed(index):
+        assert index != 30 or dark.has_started.wait(10.0)
+        if index == 100:
+            may_start.set()
+            assert has_started.wait(10.0)
+        return observation(index)
+
+    modules = {"bright": SlowAgain(lost=range(20, 1000)), "dark": dark}
+    _, atlas, log, _ = drive(modules, feed=feed, is_live=True, retry_s=2.0, steps=160)
+    assert [one["reason"] for one in events(log, "decision")] == ["first", "lost", "return"]
+    assert atlas.pose_modules[-1] == "bright"
+    assert_exact(atlas)
+
+
 def test_map_is_saved_beside_the_pose_and_its_failure_is_told(tmp_path):
     may_save, told = Event(), []
 

@@ -208,7 +208,7 @@ class Changeover:
         if handover is None:
             return
         handover.forget()
-        waited_ns = self._estimator.now_ns - trial.ready_ns  # it may need motion
+        waited_ns = self._estimator.now_ns - handover.began_ns  # it may need motion
         if (handover.is_lost or handover.is_silent) and waited_ns >= self._policy.retry_s * 1e9:
             self._end_trial()
 

@@ -39,7 +39,7 @@ class Handover:
         self._pace, self._memory = pace, memory
         self._spared_ns: list[int] = []  # of observations skipped since it tracked
         self._given_ns = anchor.stamp_ns  # the last that it was given and tracked
-        self._began_ns, self._done_ns = anchor.stamp_ns, anchor.stamp_ns - 1
+        self.began_ns, self._done_ns = anchor.stamp_ns, anchor.stamp_ns - 1
         self._reported: Transform | None = None  # the pose of the moment before, as known then
         # Time taken so far, including the start; waiting in between is not counted.
         self._cost_ns = self.runner.start_ns
@@ -71,7 +71,7 @@ class Handover:
             "module": self.runner.key,
             "handover_ms": self._cost_ns / 1e6,
             "first_pose_ms": self._first_cost_ns / 1e6,
-            "catch_up_s": (stamp_ns - self._began_ns) / 1e9,
+            "catch_up_s": (stamp_ns - self.began_ns) / 1e9,
         }
 
     def advance(self, limit: int | None) -> bool:
@@ -98,7 +98,7 @@ class Handover:
         """
         last, anchor = self.session.hold.tracking, self._memory.newest
         assert last is not None, "it tracks now"
-        self._began_ns, self._cost_ns = anchor.stamp_ns, 0
+        self.began_ns, self._cost_ns = anchor.stamp_ns, 0
         self.anchor, self.trail, self.tracked = anchor, [], [last]
         bridge = self.session.bridge = anchor.bridge.copy()
         with self._timed():
