@@ -144,6 +144,20 @@ def test_catching_up_bit_by_bit_gives_the_same_trajectory():
     assert late_ns == 9 * PERIOD_NS  # 21 moments, three at a time, while one more comes each time
 
 
+def test_a_pause_while_a_module_catches_up_costs_no_pose():
+    """It is longer than observations are remembered."""
+
+    def feed(index):
+        return observation(index if index < 63 else index + 100)
+
+    modules = {"bright": ExactModule(), "dark": ExactModule()}
+    options = {"scene_at": dark_from(40), "handover": "rewind", "buffer_s": 5.0, "feed": feed}
+    _, atlas, log, _ = drive(modules, catch_up_steps=3, **options)
+    assert events(log, "decision")[1]["stamp_ns"] > 163 * PERIOD_NS
+    assert len(atlas.trajectory) == 100 and atlas.pose_modules[-1] == "dark"
+    assert_exact(atlas)
+
+
 def test_module_that_is_lost_does_not_replace_one_that_holds():
     modules = {"bright": ExactModule(), "dark": ExactModule(lost=range(1000))}
     _, atlas, log, _ = drive(modules, scene_at=dark_from(40), handover="rewind")

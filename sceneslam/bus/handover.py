@@ -15,6 +15,7 @@ from sceneslam.types import se3
 from sceneslam.types.observation import Tracking, TrackingStatus
 from sceneslam.types.run import BRIDGED
 from sceneslam.types.se3 import Transform
+from sceneslam.types.trajectory import STAMP_MAX_NS
 
 
 class Handover:
@@ -79,10 +80,11 @@ class Handover:
 
         Raises ModuleError when the module violates its contract.
         """
-        given = 0
+        given, self._memory.read_ns = 0, STAMP_MAX_NS
         with self._timed():
             for moment in self._memory.after(self._done_ns):
                 if given == limit:
+                    self._memory.read_ns = self._done_ns
                     return False
                 given += self._go_on_to(moment)
         return True

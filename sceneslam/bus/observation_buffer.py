@@ -15,6 +15,7 @@ from sceneslam.bus.judging.gate import Witness
 from sceneslam.types.observation import Observation, Tracking
 from sceneslam.types.run import BRIDGED
 from sceneslam.types.se3 import Transform
+from sceneslam.types.trajectory import STAMP_MAX_NS
 
 _BULKY = ("image_bgr", "depth_m", "points_lidar", "point_times_s")
 
@@ -73,6 +74,7 @@ class ObservationBuffer:
         self._moments: list[BufferedObservation] = []  # by rising stamp
         self._full: list[BufferedObservation] = []  # those that still have their sensor data
         self._bytes = 0  # of that sensor data
+        self.read_ns = STAMP_MAX_NS  # entries after it are kept for a hand-over in progress
 
     @property
     def newest(self) -> BufferedObservation:
@@ -87,7 +89,7 @@ class ObservationBuffer:
     def add(self, moment: BufferedObservation) -> None:
         """Add an entry; remove those that are too old."""
         self._append(moment)
-        old_ns = moment.stamp_ns - self._span_ns - 1
+        old_ns = min(moment.stamp_ns - self._span_ns - 1, self.read_ns)
         del self._moments[: _count(self._moments, old_ns)]
         self._drop(slice(0, _count(self._full, old_ns)))
         while not self._keeps_sensors and moment.tracking is not None and len(self._full) > 1:
