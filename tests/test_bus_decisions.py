@@ -86,8 +86,16 @@ def test_the_first_choice_is_tried_again_when_it_is_due():
     running = decided(0, retry_ns=0, trial=StandbyTrial.RUNNING, **fallback)
     assert running.action is Action.GO_ON
     assert decided(0, retry_ns=0, active="a", health=Health.HELD).action is Action.GO_ON
-    passed = decided(0, trial=StandbyTrial.PASSED, **fallback)
+
+
+@pytest.mark.parametrize("health", Health)
+@pytest.mark.parametrize("tried", ["", "abc"])
+def test_a_first_choice_that_passed_its_trial_returns_whatever_the_fallback_does(health, tried):
+    changes = {"active": "b", "health": health, "tried": frozenset(tried)}
+    passed = decided(0, trial=StandbyTrial.PASSED, **changes)
     assert (passed.action, passed.to, passed.reason) == (Action.SWITCH, ("a",), "return")
+    new = decided(0, trial=StandbyTrial.PASSED, scene="Dark", choices=("c",), **changes)
+    assert (new.to, new.reason) == (("c",), "scene")
 
 
 def test_a_new_scene_keeps_a_module_that_serves_both_unless_it_failed():

@@ -222,6 +222,33 @@ def test_first_choice_comes_back_when_it_holds_beside_the_fallback():
     assert_exact(atlas)
 
 
+@pytest.mark.parametrize(("patience_s", "reason"), [(0.3, "lost"), (2.0, "return")])
+def test_first_choice_takes_over_from_its_trial_where_the_fallback_is_lost(patience_s, reason):
+    """It tracks from 73 on, so that it passes at 83; the fallback is lost at 78."""
+    bright, dark = ExactModule(lost=range(30, 73)), ExactModule(lost=range(78, 200))
+    options = {"handover": "rewind", "retry_s": 2.0, "lost_patience_s": patience_s}
+    _, atlas, log, _ = drive({"bright": bright, "dark": dark}, **options)
+    back = events(log, "decision")[2]
+    assert (back["to"], back["reason"]) == ("bright", reason)
+    assert back["stamp_ns"] == (81 if reason == "lost" else 83) * PERIOD_NS
+    assert bright.activations == 2 and len(atlas.trajectory) == 100
+    assert_exact(atlas)
+
+
+def test_motion_that_nobody_knew_is_counted_where_a_trial_ends_it():
+    """Without wheels a velocity is kept for 0.5 s; the fallback is lost for 0.9 s."""
+    bright, dark = ExactModule(lost=range(30, 85)), ExactModule(lost=range(86, 200))
+    modules = {"bright": bright, "dark": dark}  # a tenth of the patience without wheels: until 60
+    options = {"handover": "rewind", "retry_s": 2.0, "lost_patience_s": 30.0, "steps": 120}
+    _, atlas, log, _ = drive(modules, has_odometry=False, **options)
+    assert events(log, "decision")[-1]["reason"] == "return"
+    row = atlas.session_starts()[2].row
+    gap_s = np.diff(atlas.trajectory.stamps_ns).max() / 1e9
+    assert gap_s > 0.3
+    sigmas = np.sqrt(np.diagonal(atlas.covariances(has_odometry=False), axis1=1, axis2=2))
+    assert sigmas[row - 1].max() < 0.5 and (sigmas[row:, :3] > 0.9 * gap_s).all()
+
+
 def test_first_choice_that_cannot_be_placed_after_its_trial_is_refused():
     class Unplaceable(ExactModule):
         """Can be placed at its start and for its trial, and not when it returns."""

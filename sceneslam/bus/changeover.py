@@ -120,16 +120,21 @@ class Changeover:
         """Return the state of the scene's first choice, on standby beside the fallback."""
         if self._trial is None:
             return StandbyTrial.NONE
-        handover = self._trial.handover
-        tracked_ns = 0 if handover is None else handover.tracked_ns(self._estimator.now_ns)
-        return StandbyTrial.PASSED if tracked_ns >= _TRIAL_NS else StandbyTrial.RUNNING
+        return StandbyTrial.PASSED if self._tracked_ns >= _TRIAL_NS else StandbyTrial.RUNNING
+
+    @property
+    def _tracked_ns(self) -> int:
+        """Return how long the module on trial has tracked, 0 without one."""
+        handover = None if self._trial is None else self._trial.handover
+        return 0 if handover is None else handover.tracked_ns(self._estimator.now_ns)
 
     def begin(self, now: Situation, verdict: Decision, since_ns: int | None) -> None:
         """Begin to change the module.
 
         `since_ns`: when the scene that calls for it began, None for another reason.
         """
-        if verdict.reason != "return":
+        is_ready = self._tracked_ns > 0 and verdict.reason != "scene"  # that begins in the past
+        if self._trial is not None and not (is_ready and self._trial.runner.key in verdict.to[:1]):
             self._end_trial()
         self._now, self._verdict, self._since_ns = now, verdict, since_ns
         self.queue = list(verdict.to)

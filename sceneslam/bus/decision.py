@@ -70,26 +70,25 @@ GO_ON = Decision(action=Action.GO_ON)
 
 
 def decide(policy: Policy, now: Situation) -> Decision:
-    """Return what to do at an observation, by the scene first, then by the module's health."""
+    """Return what to do at an observation: by the scene, the trial, then the module's health."""
     if now.scene != now.served_scene and now.choices:
         if now.choices[0] == now.active and now.health is not Health.FAILED:
             return Decision(action=Action.TELL, reason="scene")
         return Decision(action=Action.SWITCH, to=now.choices, reason="scene")
+    if now.trial is StandbyTrial.PASSED:
+        return Decision(action=Action.SWITCH, to=now.served_choices[:1], reason="return")
     if now.health is Health.HELD:
-        return _decide_on_return(policy, now)
+        return _decide_on_trial(policy, now)
     return _decide_on_loss(policy, now)
 
 
-def _decide_on_return(policy: Policy, now: Situation) -> Decision:
+def _decide_on_trial(policy: Policy, now: Situation) -> Decision:
     """Return whether the first choice, after it was lost or refused, is tried again."""
     first = now.served_choices[:1]
-    if not first or first[0] == now.active or policy.handover == "cold":
+    is_due = now.trial is StandbyTrial.NONE and now.stamp_ns >= now.retry_ns
+    if not is_due or first in ((), (now.active,)) or policy.handover == "cold":
         return GO_ON
-    if now.trial is StandbyTrial.PASSED:
-        return Decision(action=Action.SWITCH, to=first, reason="return")
-    if now.trial is StandbyTrial.NONE and now.stamp_ns >= now.retry_ns:
-        return Decision(action=Action.TRY, to=first)
-    return GO_ON
+    return Decision(action=Action.TRY, to=first)
 
 
 def _decide_on_loss(policy: Policy, now: Situation) -> Decision:

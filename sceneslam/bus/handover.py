@@ -102,9 +102,9 @@ class Handover:
         assert last is not None, "it tracks now"
         self.began_ns, self._cost_ns = anchor.stamp_ns, 0
         self.anchor, self.trail, self.tracked = anchor, [], [last]
-        bridge = self.session.bridge = anchor.bridge.copy()
+        self.session.bridge = anchor.bridge.copy()
         with self._timed():
-            self.session.settle(last, bridge.T_map_base)
+            self.session.settle(last, anchor.T_map_base)
         self._first_cost_ns = self._cost_ns
 
     @contextmanager

@@ -133,24 +133,22 @@ class ModuleSession:
 
     def _place(self, observation: Observation, tracking: Tracking) -> Transform:
         """Return T_map_base; a module's first pose is the bridged one, handed over (Eq. 1)."""
-        assert self.runner is not None
         if not self.is_placed:
-            unknown = None
-            if self.bridge.predict(observation, by_velocity=True) is None:
-                unknown = unknown_motion(self.bridge.unknown_s(observation.stamp_ns))
-            self._placed = tracking, unknown
-            self.runner.place(self.bridge.T_map_base @ se3.inverse(tracking.T_local_base))
+            self.settle(tracking, self.bridge.predict(observation, by_velocity=True))
             self.is_placed = True
-        assert self.runner.T_map_local is not None
+        assert self.runner is not None and self.runner.T_map_local is not None
         T_map_base = self.runner.T_map_local @ tracking.T_local_base
         self.bridge.update(observation, T_map_base, is_jump=self.hold.is_revised)
         return T_map_base
 
-    def settle(self, last: Tracking, T_map_base: Transform) -> None:
-        """Place the module, which has tracked on trial, where the robot is known to be."""
+    def settle(self, tracking: Tracking, T_map_base: Transform | None) -> None:
+        """Place the module where the bridge is; what moved since is unknown without T_map_base."""
         assert self.runner is not None
-        self._placed = last, None
-        self.runner.place(T_map_base @ se3.inverse(last.T_local_base))
+        unknown = None
+        if T_map_base is None:
+            unknown = unknown_motion(self.bridge.unknown_s(tracking.stamp_ns))
+        self._placed = tracking, unknown
+        self.runner.place(self.bridge.T_map_base @ se3.inverse(tracking.T_local_base))
 
     def _doubted(self, tracking: Tracking) -> Tracking:
         """Return an answer whose map's covariance counts from where the module was placed.
