@@ -249,6 +249,18 @@ def test_motion_that_nobody_knew_is_counted_where_a_trial_ends_it():
     assert sigmas[row - 1].max() < 0.5 and (sigmas[row:, :3] > 0.9 * gap_s).all()
 
 
+def test_a_trial_that_a_new_scene_cuts_short_was_not_in_vain():
+    """It begins at 53; at 60 the new scene is confirmed."""
+    modules = {"bright": ExactModule(lost=range(30, 200)), "dark": ExactModule()}
+    modules["third"] = ExactModule()
+    table = {"Bright": ["bright", "dark"], "Dark": ["third"]}
+    options = {"scene_at": dark_from(40), "handover": "rewind", "retry_s": 2.0}
+    _, _, log, _ = drive(modules, table=table, **options)
+    assert [one["stamp_ns"] // PERIOD_NS for one in events(log, "decision")] == [0, 33, 60]
+    tried = [one for one in events(log, "situation") if one["trial"] == "running"]
+    assert tried and events(log, "situation")[-1]["retry_ns"] == 80 * PERIOD_NS
+
+
 def test_first_choice_that_cannot_be_placed_after_its_trial_is_refused():
     class Unplaceable(ExactModule):
         """Can be placed at its start and for its trial, and not when it returns."""

@@ -135,7 +135,7 @@ class Changeover:
         """
         is_ready = self._tracked_ns > 0 and verdict.reason != "scene"  # that begins in the past
         if self._trial is not None and not (is_ready and self._trial.runner.key in verdict.to[:1]):
-            self._end_trial()
+            self._drop_trial()
         self._now, self._verdict, self._since_ns = now, verdict, since_ns
         self.queue = list(verdict.to)
 
@@ -201,8 +201,7 @@ class Changeover:
             return
         first = self._candidates.of(self._candidates.scene)[:1]
         if first != (trial.runner.key,) and not trial.runner.is_failed:
-            trial.runner.retire()
-            self._trial = None
+            self._drop_trial()
             return
         try:
             handover = self._caught_up(trial)
@@ -219,7 +218,7 @@ class Changeover:
 
     def close(self) -> None:
         """Shut down every module that is being started."""
-        self._end_trial()
+        self._drop_trial()
         if self._attempt is not None:
             self._attempt.runner.retire()
             self._attempt = None
@@ -298,9 +297,12 @@ class Changeover:
         )
 
     def _end_trial(self) -> None:
+        self._candidates.postpone(self._estimator.now_ns, is_in_vain=True)
+        self._drop_trial()
+
+    def _drop_trial(self) -> None:
         if self._trial is not None:
             self._trial.runner.retire()
-            self._candidates.postpone(self._estimator.now_ns, is_in_vain=True)
         self._trial = None
 
     def _ready_ns(self, key: str) -> int:
