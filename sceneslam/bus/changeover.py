@@ -211,9 +211,9 @@ class Changeover:
             return
         if handover is None:
             return
-        handover.forget()
+        handover.trail, handover.tracked = [], []  # on trial its poses are not the robot's
         waited_ns = self._estimator.now_ns - handover.began_ns  # it may need motion
-        if (handover.is_lost or handover.is_silent) and waited_ns >= self._policy.retry_s * 1e9:
+        if handover.fault and waited_ns >= self._policy.retry_s * 1e9:
             self._end_trial()
 
     def close(self) -> None:
@@ -245,9 +245,8 @@ class Changeover:
             return self._refuse(attempt.runner, "failed")
         if handover is None:
             return None
-        if (handover.is_lost or handover.is_silent) and self._can_refuse():
-            why = "lost" if handover.is_lost else "silent"
-            return self._refuse(attempt.runner, why)
+        if handover.fault and self._can_refuse():
+            return self._refuse(attempt.runner, handover.fault)
         self._estimator.accept(handover)
         is_in_vain = None
         if self._now.active and self._now.health is not Health.HELD:  # what it leaves has ended
@@ -275,9 +274,8 @@ class Changeover:
 
     def _can_refuse(self) -> bool:
         """Tell whether there is an alternative to a lost module; the paper has no such check."""
-        if self._policy.handover == "cold":
-            return False
-        return bool(self.queue) or self._estimator.session.hold.is_held
+        has_other = bool(self.queue) or self._estimator.session.hold.is_held
+        return has_other and self._policy.handover != "cold"
 
     def _refuse(self, runner: Runner, why: str) -> bool:
         runner.retire()

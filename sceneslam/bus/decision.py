@@ -112,7 +112,8 @@ def _decide_on_loss(policy: Policy, now: Situation) -> Decision:
         left, rounds = others, now.rounds + 1
     if _is_adrift(policy, now):
         left = (*left, now.active)  # anew, with an empty map
-    is_over = now.health is Health.FAILED or lost_ns >= _patience_ns(policy, now)
+    patience_s = policy.lost_patience_s * (_BLIND if now.is_blind else 1.0)
+    is_over = now.health is Health.FAILED or lost_ns >= round(patience_s * 1e9)
     is_waiting = not left and not now.active and now.may_return
     if not is_over or is_waiting or (not left and now.health is not Health.FAILED):
         return GO_ON
@@ -123,11 +124,6 @@ def _is_adrift(policy: Policy, now: Situation) -> bool:
     if now.health is not Health.LOST or now.adrift_since_ns is None:
         return False
     return now.stamp_ns - now.adrift_since_ns >= round(policy.retry_s * 1e9)
-
-
-def _patience_ns(policy: Policy, now: Situation) -> int:
-    share = _BLIND if now.is_blind else 1.0
-    return round(share * policy.lost_patience_s * 1e9)
 
 
 def in_json(record: Situation | Decision) -> dict[str, Any]:

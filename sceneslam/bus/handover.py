@@ -47,16 +47,14 @@ class Handover:
         self._first_cost_ns = 0  # the same until the first pose
 
     @property
-    def is_lost(self) -> bool:
-        """Tell whether the module's last answer was not usable."""
+    def fault(self) -> str:
+        """Return why the module would be left at once: `lost` or `silent`, "" if it would not."""
         hold = self.session.hold
-        return hold.status is TrackingStatus.LOST or hold.is_suspect
-
-    @property
-    def is_silent(self) -> bool:
-        """Tell whether the module has got no data for so long that it would be left at once."""
-        since_ns = self.session.hold.unheld_since_ns
-        return since_ns is not None and self._done_ns - since_ns >= self.session.hold.patience_ns
+        if hold.status is TrackingStatus.LOST or hold.is_suspect:
+            return "lost"
+        since_ns = hold.unheld_since_ns
+        has_data = since_ns is None or self._done_ns - since_ns < hold.patience_ns
+        return "" if has_data else "silent"
 
     def tracked_ns(self, stamp_ns: int) -> int:
         """Return how long it has tracked without a break, 0 if not at the newest observation."""
@@ -88,10 +86,6 @@ class Handover:
                     return False
                 given += self._go_on_to(moment)
         return True
-
-    def forget(self) -> None:
-        """Forget what it did on trial: its poses are not the robot's."""
-        self.trail, self.tracked = [], []
 
     def settle(self) -> None:
         """Place the module, which has caught up, at the pose of the newest observation.

@@ -144,10 +144,8 @@ class ModuleSession:
     def settle(self, tracking: Tracking, T_map_base: Transform | None) -> None:
         """Place the module where the bridge is; what moved since is unknown without T_map_base."""
         assert self.runner is not None
-        unknown = None
-        if T_map_base is None:
-            unknown = unknown_motion(self.bridge.unknown_s(tracking.stamp_ns))
-        self._placed = tracking, unknown
+        unknown = unknown_motion(self.bridge.unknown_s(tracking.stamp_ns))
+        self._placed = tracking, unknown if T_map_base is None else None
         self.runner.place(self.bridge.T_map_base @ se3.inverse(tracking.T_local_base))
 
     def _doubted(self, tracking: Tracking) -> Tracking:
