@@ -15,7 +15,6 @@ from sceneslam.types import se3
 from sceneslam.types.observation import Tracking, TrackingStatus
 from sceneslam.types.run import BRIDGED
 from sceneslam.types.se3 import Transform
-from sceneslam.types.trajectory import STAMP_MAX_NS
 
 
 class Handover:
@@ -78,11 +77,11 @@ class Handover:
 
         Raises ModuleError when the module violates its contract.
         """
-        given, self._memory.read_ns = 0, STAMP_MAX_NS
+        given = 0
         with self._timed():
             for moment in self._memory.after(self._done_ns):
                 if given == limit:
-                    self._memory.read_ns = self._done_ns
+                    self._memory.keep_from(self._done_ns)
                     return False
                 given += self._go_on_to(moment)
         return True

@@ -74,7 +74,7 @@ class ObservationBuffer:
         self._moments: list[BufferedObservation] = []  # by rising stamp
         self._full: list[BufferedObservation] = []  # those that still have their sensor data
         self._bytes = 0  # of that sensor data
-        self.read_ns = STAMP_MAX_NS  # entries after it are kept for a hand-over in progress
+        self._read_ns = STAMP_MAX_NS  # entries after it are not removed by the next one
 
     @property
     def newest(self) -> BufferedObservation:
@@ -89,13 +89,18 @@ class ObservationBuffer:
     def add(self, moment: BufferedObservation) -> None:
         """Add an entry; remove those that are too old."""
         self._append(moment)
-        old_ns = min(moment.stamp_ns - self._span_ns - 1, self.read_ns)
+        old_ns = min(moment.stamp_ns - self._span_ns - 1, self._read_ns)
+        self._read_ns = STAMP_MAX_NS
         del self._moments[: _count(self._moments, old_ns)]
         self._drop(slice(0, _count(self._full, old_ns)))
         while not self._keeps_sensors and moment.tracking is not None and len(self._full) > 1:
             self._strip(0)
         while self._bytes > self._limit_bytes and len(self._full) > 2:
             self._strip(self._least_missed())
+
+    def keep_from(self, stamp_ns: int) -> None:
+        """Keep the entries after a stamp, which a hand-over is led through, when one is added."""
+        self._read_ns = min(self._read_ns, stamp_ns)
 
     def anchor(self, until_ns: int | None) -> BufferedObservation:
         """Return the newest trusted entry, not after `until_ns` if that is given.
