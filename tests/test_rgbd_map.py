@@ -200,6 +200,20 @@ def test_depth_is_missing_at_depth_edges_and_where_it_is_not_a_number():
     assert (features.depth_m[(v > 102) & (u < 317)] == 1.0).all()
 
 
+def test_depth_is_missing_for_colours_that_another_camera_sees_outside_of_the_depth_image():
+    alignment = Alignment(focal_ratio=0.7)
+    extractor = FeatureExtractor(
+        CAMERA, alignment, count=500, fast_threshold_min=7, fast_noise_ratio=4.0
+    )
+    gray = patchwork(np.random.default_rng(0))
+    features = extractor.extract(gray, np.ones((480, 640), np.float32))
+    centre = np.array([CAMERA.cx, CAMERA.cy])
+    uv_depth = np.rint((features.uv_px - centre) / 0.7 + centre)
+    inside = ((uv_depth >= 0) & (uv_depth < CAMERA.size_wh)).all(axis=1)
+    assert 20 < inside.sum() < len(features) - 20
+    np.testing.assert_array_equal(features.depth_m, np.where(inside, 1.0, 0.0))
+
+
 @pytest.mark.parametrize(("height_m", "has_scans"), [(0.0, True), (0.5, False)])
 def test_only_a_robot_in_the_plane_gives_scans(height_m, has_scans):
     layers = LayerBuilder(CAMERA, cloud_stride_px=8, cloud_voxel_m=0.03, grid_resolution_m=0.05)

@@ -91,7 +91,7 @@ class FeatureExtractor:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the depth at each corner, and its slope [m/px].
 
-        At depth edges, where it may be either, it is missing.
+        At depth edges, where it may be either, it is missing, as outside of the depth image.
         """
         if depth_m is None:
             return np.zeros(len(uv_image)), np.zeros(len(uv_image))
@@ -101,6 +101,7 @@ class FeatureExtractor:
         at = np.clip(rows, 0, height - 1) * width + np.clip(columns, 0, width - 1)
         depths = np.take(depth_m, at).astype(np.float64)  # (5, N), the corner's own first
         usable = self._camera.measures(depths)
+        usable[0] &= (column >= 0) & (column < width) & (row >= 0) & (row < height)
         depth = np.where(usable[0], depths[0], 0.0)
         step = np.where(usable, np.abs(depths - depth), 0.0).max(axis=0)
         is_smooth = step <= _DEPTH_SPREAD_RATIO * depth * np.maximum(depth, 1.0)
