@@ -234,6 +234,14 @@ def test_frozen_image_over_moving_depth_is_not_trusted(shared_data):
     assert all(answer.status is not TrackingStatus.TRACKING for answer in answers)
 
 
+def test_poses_that_odometry_leads_are_the_less_certain_the_farther_it_leads():
+    answers = drive(make(degraded_inliers=1000), [room_observation(index) for index in range(15)])
+    assert {answer.status for answer in answers[1:]} == {TrackingStatus.DEGRADED}
+    sigmas_m = np.sqrt([np.trace(answer.covariance[:3, :3]) for answer in answers[1:]])
+    assert (np.diff(sigmas_m) > 0).all()
+    assert 0.001 < sigmas_m[-1] < 0.1  # after 14 cm
+
+
 @pytest.mark.parametrize("has_odometry", [False, True])
 def test_image_that_is_repeated_holds_no_pose(has_odometry):
     def seen(index):

@@ -41,6 +41,8 @@ def test_new_place_is_hung_on_odometry_after_it_was_looked_for_in_the_map():
     assert {answer.status for answer in answers[6:16]} == {TrackingStatus.LOST}
     assert {answer.status for answer in answers[16:19]} == {TrackingStatus.LOST}
     assert answers[19].status is TrackingStatus.DEGRADED
+    wheels_rad = np.sqrt(answers[19].covariance[5, 5])  # after 2 rad in the dark
+    assert wheels_rad > 10.0 * np.sqrt(answers[5].covariance[5, 5])
     assert answers[-1].status is TrackingStatus.TRACKING
     first = room_observation(0).T_odom_base
     truth = se3.inverse(first) @ turned @ se3.from_xy_yaw(0.07, 0, 0)

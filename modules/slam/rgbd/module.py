@@ -28,7 +28,7 @@ from .see.turn_rate import expected_rate
 from .see.view import View
 from .settings import RgbdSettings
 
-_START_VARIANCE = 1e-8  # the first pose is the origin by definition
+_START_VARIANCE = 1e-8  # the map begins at its first pose
 
 
 @dataclass(kw_only=True, eq=False)
@@ -152,7 +152,8 @@ class RgbdSlam(LocalModule, RgbdSettings):
         is_scaled = not view.is_monocular or view.observation.T_odom_base is not None
         if not (view.shows_enough and is_scaled):
             return self._lose(view.observation, prediction)
-        is_placed = prediction.is_measured or not len(self._parts.map.keyframes)
+        begins = not len(self._parts.map.keyframes)
+        is_placed = prediction.is_measured or begins
         guessed_s = None if is_placed else self._predictor.unmeasured_s(view.observation)
         self._hold_pose(view.observation, view.T_predicted, prediction.covariance)
         self._held_ids = self._parts.insert(view, self._T_local_base, set(), guessed_s=guessed_s)
@@ -163,7 +164,7 @@ class RgbdSlam(LocalModule, RgbdSettings):
         return self._answer(
             view.observation,
             TrackingStatus.TRACKING if is_first else TrackingStatus.DEGRADED,
-            covariance=_START_VARIANCE * np.eye(6) if is_first else None,
+            covariance=_START_VARIANCE * np.eye(6) if begins else prediction.covariance,
             inliers=view.features.deep_count,
         )
 
@@ -205,15 +206,14 @@ class RgbdSlam(LocalModule, RgbdSettings):
         if wanted and (status is TrackingStatus.TRACKING or (is_by_odometry and view.is_monocular)):
             self._held_ids = self._parts.insert(view, T_local_base, segment, fix=fix)
         self._parts.memory.hold(view.observation.stamp_ns, T_local_base, fix.landmark_ids)
-        covariance = None
+        covariance = prediction.covariance
         if not is_by_odometry:
             around = self._parts.memory.around(T_local_base)
             covariance = self._parts.certainty.covariance(view, fix, T_local_base, around)
             if self._parts.health.is_unsure(covariance - self._parts.certainty.by_wheels):
                 status = TrackingStatus.DEGRADED
         if segment is not None:  # that of its position counts, too
-            measured = np.zeros((6, 6)) if covariance is None else covariance
-            guessed = self._parts.memory.segments.covariance(segment, T_local_base, measured)
+            guessed = self._parts.memory.segments.covariance(segment, T_local_base, covariance)
             if guessed is not None:
                 status, covariance = TrackingStatus.DEGRADED, guessed
         return self._answer(
