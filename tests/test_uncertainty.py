@@ -1,5 +1,7 @@
 """The trajectory's covariance: marginals through hand-overs and loops."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from driving import drive, events
@@ -166,6 +168,17 @@ def test_a_claim_is_held_against_the_difference_at_the_handover():
     assert bad[-1, 0, 0] > 3.0 * good[-1, 0, 0]
     resting = calibrated(path, "ab", differing(0.002, np.eye(4)))
     np.testing.assert_array_equal(resting.reported, path.reported)
+
+
+def test_a_drift_that_a_module_knows_of_is_no_error_of_the_other():
+    path = path_of("0" * 20 + "1" * 20, CLAIM)
+    path.of_maps[20:] = np.linspace(0.0, 0.05, 20)[:, None, None] ** 2 * np.eye(6)
+    drifting = differing(0.02, poses=101)
+    found, blamed = (
+        calibrated(each, "ab", drifting).reported[0, 0, 0]
+        for each in (path, replace(path, of_maps=np.full((40, 6, 6), np.nan)))
+    )
+    assert found < 2.0 * CLAIM[0, 0] < 0.5 * blamed
 
 
 @pytest.mark.parametrize(("poses", "ratio"), [(5, 0.227), (20, 0.0127), (101, 7.9e-4)])

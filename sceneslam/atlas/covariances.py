@@ -49,9 +49,18 @@ class PosedPath:
         return np.asarray(np.linalg.inv(np.linalg.inv(reported + _LEAST).mean(axis=0)))
 
     def claims(self) -> list[Covariance | None]:
-        """Return the claim of each session."""
-        count = int(self.sessions.max(initial=-1)) + 1
-        return [self.claim(np.flatnonzero(self.sessions == session)) for session in range(count)]
+        """Return the claim of each session, with what its map is known to drift per submap."""
+        T, maps = self.T_map_base, np.nan_to_num(self.of_maps)
+        found, submaps = [], _submaps(_moved(T))
+        for session in range(int(self.sessions.max(initial=-1)) + 1):
+            rows = np.flatnonzero(self.sessions == session)
+            claim = self.claim(rows)
+            if claim is not None:
+                first, last = rows[[0, -1]]
+                drift = grown(maps[first], maps[last], se3.inverse(T[last]) @ T[first])
+                claim = claim + drift / max(submaps[last] - submaps[first], 1.0)
+            found.append(claim)
+        return found
 
 
 def covariances(path: PosedPath, *, loops: Sequence[Edge], bridge: Drift) -> NDArray[np.float64]:
