@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from sceneslam.atlas.atlas import Atlas
 from sceneslam.interfaces import SlamModule
 from sceneslam.modules.slam.odometry import Odometry
 from sceneslam.types import se3
@@ -43,17 +44,30 @@ def test_pose_is_odometry_since_the_first_observation():
 
 def test_doubt_grows_with_the_way():
     module = active()
-    traces = [np.trace(module.track(observation).covariance) for observation in arc(100)]
-    assert np.all(np.diff(traces) > 0)
-    covariance = module.track(arc(101)[-1]).covariance
-    assert 0.05 < np.sqrt(covariance[0, 0]) < 1.0
-    assert np.linalg.eigvalsh(covariance).min() > 0
+    trackings = [module.track(observation) for observation in arc(100)]
+    assert np.all(np.diff([np.trace(each.map_covariance) for each in trackings]) > 0)
+    drift = trackings[-1].map_covariance
+    assert 0.05 < np.sqrt(drift[0, 0]) < 1.0
+    assert np.linalg.eigvalsh(drift).min() > 0
+
+
+def test_the_whole_way_counts_once_in_the_atlas():
+    module, atlas = active(), Atlas(voxel_m=0.05)
+    atlas.begin_session("odometry", np.eye(4))
+    trackings = [module.track(observation) for observation in arc(400, yaw_step_rad=0.0)]
+    for each in trackings:
+        atlas.add(
+            each.stamp_ns, each.T_local_base, "odometry", each.covariance, each.map_covariance
+        )
+    covariances = atlas.covariances(True)[-1], trackings[-1].map_covariance
+    found, drifted = (np.sqrt(np.diag(each))[[0, 1, 5]] for each in covariances)
+    np.testing.assert_allclose(found, drifted, rtol=0.2)
 
 
 def test_standing_still_adds_no_doubt():
     module = active()
     observations = [Observation(stamp_ns=i * 10**8, T_odom_base=np.eye(4)) for i in range(50)]
-    covariances = [module.track(observation).covariance for observation in observations]
+    covariances = [module.track(observation).map_covariance for observation in observations]
     np.testing.assert_allclose(covariances[0], covariances[-1], atol=1e-12)
 
 

@@ -14,7 +14,7 @@ from sceneslam.types.rig import Rig, Sensor
 
 from .local import LocalModule
 
-_DEVIATION_MIN = 1e-4  # m and rad: smallest standard deviation
+_LEAST = 1e-4**2 * np.eye(6)  # (0.1 mm, 0.1 mrad)^2: smallest covariance
 
 
 class Odometry(LocalModule):
@@ -30,7 +30,7 @@ class Odometry(LocalModule):
         self._wheels = rig.wheels
         self._T_odom_base: se3.Transform | None = None  # last odometry
         self._T_local_base = se3.identity()
-        self._covariance = np.eye(6) * _DEVIATION_MIN**2
+        self._drift = _LEAST  # (6, 6) since then
 
     def track(self, observation: Observation) -> Tracking:
         """Return T_local_base (4, 4) [m]; LOST without odometry.
@@ -51,10 +51,10 @@ class Odometry(LocalModule):
         along = self._wheels.drift_ratio * distance_m
         turn = self._wheels.drift_ratio * angle_rad + self._wheels.drift_rad_per_m * distance_m
         # Errors of odometry are systematic: standard deviations add up, not variances.
-        covariance = se3.carried(self._covariance, se3.inverse(T_prev_curr))
+        covariance = se3.carried(self._drift, se3.inverse(T_prev_curr))
         deviation = np.sqrt(np.diag(covariance)) + np.array([along] * 3 + [turn] * 3)
         scale = deviation / np.sqrt(np.diag(covariance))
-        self._covariance = covariance * np.outer(scale, scale)
+        self._drift = covariance * np.outer(scale, scale)
         self._T_local_base = self._T_local_base @ T_prev_curr
 
     def _answer(self, observation: Observation, status: TrackingStatus) -> Tracking:
@@ -63,6 +63,7 @@ class Odometry(LocalModule):
             stamp_ns=observation.stamp_ns,
             T_local_base=self._T_local_base.copy(),
             status=status,
-            covariance=None if is_lost else self._covariance.copy(),
+            covariance=None if is_lost else _LEAST.copy(),
+            map_covariance=None if is_lost else self._drift.copy(),
             quality_ratio=0.0 if is_lost else 1.0,
         )
