@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from rgbd_features import AT_REST, empty_map, features_at, random_descriptors
 
+from sceneslam.modules.slam.rgbd.locate import recognition
 from sceneslam.modules.slam.rgbd.locate.localizer import VisualLocalizer
 from sceneslam.modules.slam.rgbd.locate.pose_solver import PoseSolver
 from sceneslam.modules.slam.rgbd.loops.loop_fusion import fuse_duplicates
@@ -212,6 +213,43 @@ def test_depth_is_missing_for_colours_that_another_camera_sees_outside_of_the_de
     inside = ((uv_depth >= 0) & (uv_depth < CAMERA.size_wh)).all(axis=1)
     assert 20 < inside.sum() < len(features) - 20
     np.testing.assert_array_equal(features.depth_m, np.where(inside, 1.0, 0.0))
+
+
+BARREL = replace(CAMERA, distortion=(-0.3, 0.1, 0.002, -0.001, 0.0))
+
+
+def depth_of_two_walls(T_base_other):
+    """The depth [m] that a camera with distortion has of two slanted walls, from another pose."""
+    v, u = np.mgrid[:480, :640].astype(float)
+    pixels = np.stack([u.ravel(), v.ravel()], axis=-1)[:, None]
+    rays = cv2.undistortPoints(pixels, BARREL.K, np.array(BARREL.distortion))[:, 0]
+    T_other_cam = T_base_other @ BARREL.T_base_cam
+    rays_base = np.column_stack([rays, np.ones(len(rays))]) @ T_other_cam[:3, :3].T
+    normals = np.array([[0.7, 0.7, 0.0], [0.7, -0.7, 0.2]])
+    depths_m = (2.0 - normals @ T_other_cam[:3, 3]) / (rays_base @ normals.T)
+    return np.where(depths_m > 0, depths_m, np.inf).min(axis=1).reshape(480, 640).astype("f4")
+
+
+def test_points_of_a_camera_with_distortion_lie_on_the_walls():
+    layers = LayerBuilder(BARREL, cloud_stride_px=8, cloud_voxel_m=0.03, grid_resolution_m=0.05)
+    image_bgr = np.zeros((480, 640, 3), np.uint8)
+    points = layers.view(depth_of_two_walls(np.eye(4)), image_bgr, stamp_ns=0).points_base
+    assert len(points) > 4000
+    beyond_m = (points @ np.array([[0.7, 0.7, 0.0], [0.7, -0.7, 0.2]]).T).max(axis=1) - 2.0
+    assert np.abs(beyond_m).max() < 0.003
+
+
+def test_surfaces_agree_from_another_pose_of_a_camera_with_distortion(monkeypatch):
+    monkeypatch.setattr(recognition, "_SURFACE_SLACK_M", 0.01)
+    monkeypatch.setattr(recognition, "_SURFACE_SIGMAS", 0.0)
+    layers = LayerBuilder(BARREL, cloud_stride_px=8, cloud_voxel_m=0.03, grid_resolution_m=0.05)
+    keyframe, image_bgr = keyframe_at(0, camera=BARREL), np.zeros((480, 640, 3), np.uint8)
+    keyframe.view = layers.view(depth_of_two_walls(np.eye(4)), image_bgr, stamp_ns=0)
+    recognizer = recognition.PlaceRecognizer(empty_map(BARREL), None, min_inliers=20)
+    for T_local_base in (np.eye(4), se3.from_xy_yaw(0.3, 0.2, 0.3)):
+        depth_m = depth_of_two_walls(T_local_base)
+        assert recognizer._shows(keyframe, T_local_base, depth_m)
+        assert not recognizer._shows(keyframe, T_local_base, 0.98 * depth_m)
 
 
 @pytest.mark.parametrize(("height_m", "has_scans"), [(0.0, True), (0.5, False)])

@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 
 from sceneslam.types.rig import Camera
 
+from .undistortion import DepthUndistortion
+
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 
@@ -87,11 +89,7 @@ class DepthSurfaceReader:
         near_m, far_m = camera.depth_range_m
         self._range_m = (max(near_m, _NEAR_M), far_m)  # 0 is missing in any case
         self._crop = (slice(rows * self._factor), slice(columns * self._factor))
-        self._undistort = None
-        if any(camera.distortion):
-            self._undistort = cv2.initUndistortRectifyMap(
-                camera.K, np.array(camera.distortion), None, camera.K, (width, height), cv2.CV_16SC2
-            )
+        self._undistortion = DepthUndistortion(camera)
 
     def read(self, depth_m: Floats) -> Surface:
         """Return the surface of a depth image (H, W) [m]; cells of 0 or NaN are invalid."""
@@ -112,11 +110,7 @@ class DepthSurfaceReader:
 
     def _cells(self, depth_m: Floats) -> tuple[Floats, Floats]:
         """Return the mean disparity per cell, and 1 where at least half of the cell has depth."""
-        if self._undistort is not None:
-            depth_m = np.asarray(
-                cv2.remap(depth_m, *self._undistort, cv2.INTER_NEAREST), np.float32
-            )
-        depth_m = depth_m[self._crop]
+        depth_m = self._undistortion.apply(depth_m)[self._crop]
         with np.errstate(invalid="ignore"):
             known = (depth_m >= self._range_m[0]) & (depth_m <= self._range_m[1])
         disparity = np.divide(1.0, depth_m, out=np.zeros_like(depth_m), where=known)

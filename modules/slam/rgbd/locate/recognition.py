@@ -11,6 +11,7 @@ from sceneslam.types import se3
 from sceneslam.types.se3 import Transform
 from sceneslam.views.place_index import PlaceIndex
 
+from ...surfaces.undistortion import DepthUndistortion
 from ..map.keyframes import Keyframe
 from ..map.visual_map import VisualMap
 from ..see.features import Features
@@ -43,6 +44,7 @@ class PlaceRecognizer:
     ) -> None:
         self._map, self._localizer = visual_map, localizer
         self._min_inliers = min_inliers
+        self._undistortion = DepthUndistortion(visual_map.depth_camera)
         self.places = PlaceIndex()
 
     def recognize(
@@ -77,6 +79,7 @@ class PlaceRecognizer:
         points_cam = points_cam[points_cam[:, 2] > camera.depth_range_m[0]]
         z = points_cam[:, 2]
         uv_px = points_cam[:, :2] / z[:, None] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+        depth_m = self._undistortion.apply(depth_m)
         column, row = np.rint(uv_px).astype(np.int64).T
         inside = (column >= 0) & (column < camera.size_wh[0])
         inside &= (row >= 0) & (row < camera.size_wh[1])

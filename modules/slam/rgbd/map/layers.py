@@ -15,6 +15,7 @@ from sceneslam.types.errors import ConfigError
 from sceneslam.types.maps import MapLayers, PointLayer, ScanLayer
 from sceneslam.types.rig import Camera
 
+from ..see.lens import undistorted
 from .keyframes import DepthView, Keyframe, nothing_seen
 
 _LOG = logging.getLogger(__name__)
@@ -36,8 +37,12 @@ class LayerBuilder:
         grid_resolution_m: float,
     ) -> None:
         self._camera = camera
-        self._stride_px, self._voxel_m = cloud_stride_px, cloud_voxel_m
-        self._resolution_m = grid_resolution_m
+        self._voxel_m, self._resolution_m = cloud_voxel_m, grid_resolution_m
+        self._sampled = 2 * (slice(cloud_stride_px // 2, None, cloud_stride_px),)
+        width, height = camera.size_wh
+        v, u = (axis[self._sampled] for axis in np.mgrid[:height, :width].astype(np.float64))
+        uv_image = np.stack([u, v], axis=-1)
+        self._uv_px = undistorted(camera, uv_image.reshape(-1, 2)).reshape(uv_image.shape)
         self._scanner = _make_scanner(camera)
 
     def view(
@@ -46,16 +51,16 @@ class LayerBuilder:
         """Return the part of a depth image (H, W) [m] for the layers: every stride-th pixel."""
         if depth_m is None:
             return nothing_seen()
-        camera, step = self._camera, self._stride_px
-        depth = depth_m[step // 2 :: step, step // 2 :: step]
+        camera, depth = self._camera, depth_m[self._sampled]
         row, column = np.nonzero(camera.measures(depth))
         z = depth[row, column]
-        v, u = row * step + step // 2, column * step + step // 2
+        u, v = self._uv_px[row, column].T
         x, y = (u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z
         points_cam = np.stack([x, y, z], axis=1).astype(np.float32)
         points_base = se3.apply(camera.T_base_cam, points_cam).astype(np.float32)
         scan = None if self._scanner is None else self._scanner.scan(depth_m, stamp_ns=stamp_ns)
-        return DepthView(points_base=points_base, colors_bgr=image_bgr[v, u], scan=scan)
+        colors_bgr = image_bgr[self._sampled][row, column]
+        return DepthView(points_base=points_base, colors_bgr=colors_bgr, scan=scan)
 
     def build(self, keyframes: Sequence[Keyframe]) -> MapLayers:
         """Return the layers in `local`; scans only for planar motion."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,6 +11,7 @@ from sceneslam.types.rig import Camera
 
 from .alignment import Alignment
 from .corners import CornerFinder
+from .lens import undistorted
 
 _DEPTH_REACH_PX = 2  # around a corner, in which the surface should be the same
 _CROSS_PX = _DEPTH_REACH_PX * np.array([[0, -1, 1, 0, 0], [0, 0, 0, -1, 1]])  # columns, rows
@@ -58,7 +58,7 @@ class FeatureExtractor:
     def extract(self, gray: NDArray[np.uint8], depth_m: NDArray[np.float32] | None) -> Features:
         """Return the features of `gray` (H, W); without a depth image all depths are missing."""
         corners = self._corners.find(gray)
-        uv_px = self._undistort(corners.uv_px)
+        uv_px = undistorted(self._camera, corners.uv_px)
         depths_m, slopes = self._depths(self._in_depth(corners.uv_px, uv_px, depth_m), depth_m)
         return Features(
             uv_px=uv_px,
@@ -67,12 +67,6 @@ class FeatureExtractor:
             depth_m=depths_m,
             depth_slope_m_per_px=slopes,
         )
-
-    def _undistort(self, uv_image: NDArray[np.float64]) -> NDArray[np.float64]:
-        if not (len(uv_image) and any(self._camera.distortion)):
-            return uv_image
-        K, distortion = self._camera.K, np.array(self._camera.distortion)
-        return np.asarray(cv2.undistortPoints(uv_image[:, None], K, distortion, P=K)[:, 0])
 
     def _in_depth(
         self,
