@@ -34,6 +34,7 @@ from sceneslam.config.words import (
     is_override,
     readable,
     shortened,
+    takes_rows,
 )
 from sceneslam.detection.run import detect
 from sceneslam.doctor import examine
@@ -140,7 +141,7 @@ def _said(error: Exception) -> str:
 def _without_advice(error: HydraException) -> str:
     """Return Hydra's message without misleading advice."""
     missing = str(getattr(error.__cause__, "full_key", None) or "of that name")
-    if missing.startswith("scenes."):  # a table that can have more rows
+    if takes_rows(getattr(error.__cause__, "parent_node", None)):
         return str(error)
     there = f"There is no key {missing}; --cfg job shows all"
     return re.sub(r"To append to your config use \+(.*)", there, str(error))

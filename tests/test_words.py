@@ -9,13 +9,15 @@ from pathlib import Path
 
 import pytest
 from configured import config
+from hydra import compose, initialize_config_module
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
 from sceneslam.app import run
 from sceneslam.config.check import check_node
 from sceneslam.config.files import check_yaml
-from sceneslam.config.words import check_trust, how_to_quote, readable
+from sceneslam.config.words import check_trust, how_to_quote, readable, takes_rows
 from sceneslam.sources.bag.open_recording import open_recording
 from sceneslam.sources.tum_rgbd import TumRgbd
 from sceneslam.types.errors import ConfigError, InputError
@@ -55,6 +57,34 @@ def call(folder, *words, **more):
 def test_path_is_read_as_it_is_typed(path):
     word = readable(f"source.path={path}", is_sweep=False)
     assert OverridesParser.create().parse_override(word).value() == path
+
+
+@pytest.mark.parametrize(
+    ("words", "has_rows"),
+    [
+        (["evaluation.scenes={Hall: Bright}"], True),
+        (["+evaluation.scenes.Hall=Bright", "evaluation.scenes.Tunnel=Dark"], True),
+        (["detector=rules", "detector.values.dim=60"], True),
+        (["detector=rules", "detector.rules.tunnel={scene: Tunnel}"], True),
+        (["detector=rules", "detector.rules.dark.when.corner_count=[null, 1]"], True),
+        (["policy.startup_s.dark=8"], True),
+        (["scenes={Dark: [dark]}"], True),
+        (["+experiment=tune", 'tune.train.mine=["seed=3"]'], True),
+        (["detector=rules", "detector.rules.dark.wen={grey_mean: [null, 1]}"], False),
+        (["policy.typo=1"], False),
+        (["policy={typo: 1}"], False),
+        (["source.camera.fow_deg=60"], False),
+        (["slam.dark=depth"], False),
+        (["typo=1"], False),
+    ],
+)
+def test_rows_can_be_added_to_tables_of_any_names(words, has_rows):
+    with (
+        initialize_config_module("sceneslam.conf", version_base="1.3"),
+        pytest.raises(HydraException, match="append to your config") as caught,
+    ):
+        compose("config", overrides=words)
+    assert takes_rows(caught.value.__cause__.parent_node) is has_rows
 
 
 def test_what_hydra_reads_stays_as_it_is():

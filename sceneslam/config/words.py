@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import accumulate
-from typing import Any
+from typing import Any, cast, get_args, get_origin
 
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -14,6 +14,7 @@ from hydra.core.override_parser.types import Override, QuotedString
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
+from sceneslam.config.check import hints_of, locate
 from sceneslam.types.errors import ConfigError
 
 _PATH = re.compile(r"(\+{0,2}[\w.@/]*(?:path|dir))=(.*)", re.DOTALL)
@@ -108,6 +109,27 @@ def typed_targets(words: Sequence[str]) -> Any:
     """Return what words of the command line set `allow_targets` to, [] if none does."""
     typed = [one.value() for one in map(_parsed, words) if one and one.key_or_group == _TRUST]
     return _plain(typed[-1]) if typed else []
+
+
+def takes_rows(table: object) -> bool:
+    """Tell whether a table of the configuration can have more rows, under any names."""
+    if not isinstance(table, DictConfig) or "_target_" in table:
+        return False
+    owner = table._get_parent()
+    if not isinstance(owner, DictConfig) or owner._get_parent() is None:
+        return bool(table._key() == "scenes")  # the others of the top level hold components
+    rows = cast("dict[str, Any]", OmegaConf.to_container(table))
+    return all(isinstance(row, dict | list) for row in rows.values()) or _is_by_name(table, owner)
+
+
+def _is_by_name(table: DictConfig, owner: DictConfig) -> bool:
+    """Tell whether a component takes a table as a mapping of names to values of one type."""
+    try:
+        target = locate(owner.get("_target_"), "_target_", ())
+    except ConfigError:
+        return False
+    hint = hints_of(target).get(str(table._key()))
+    return get_origin(hint) in (dict, Mapping) and Any not in get_args(hint)
 
 
 def _parsed(word: str) -> Override | None:
