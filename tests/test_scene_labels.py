@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 from itertools import product
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from sceneslam.scenes.examples import Example, MeasuredExample
 from sceneslam.scenes.label import Labels, cheapest
 from sceneslam.scenes.train import train
 from sceneslam.scenes.words import read_word
+from sceneslam.script import composed
 from sceneslam.types.trajectory import Trajectory
 
 FIRST_NS = 10**12
@@ -102,7 +104,18 @@ def test_every_instant_gets_the_module_whose_error_grew_least(runs, tmp_path, ca
     assert main(["label", str(tmp_path / "labels.yaml"), str(runs)]) == 0
     (first, second) = spans_of(tmp_path / "labels.yaml")
     assert first == ("eyes", 0.0) and second[0] == "laser" and second[1] == pytest.approx(5, abs=1)
-    assert '"scenes={eyes:[eyes,laser],laser:[laser,eyes]}"' in capsys.readouterr().out
+    assert '"+scenes={eyes:[eyes,laser],laser:[laser,eyes]}"' in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("runs", [True], indirect=True)
+def test_the_table_that_is_printed_composes_with_modules_of_these_names(runs, tmp_path, capsys):
+    assert main(["label", str(tmp_path / "labels.yaml"), str(runs)]) == 0
+    (line,) = re.findall(r"^table +(.*)$", capsys.readouterr().out, re.M)
+    words = ["+slam@slam.eyes=rgbd", "+slam@slam.laser=laser", *shlex.split(line)]
+    assert composed(tuple(words), None)["scenes"] == {
+        "eyes": ["eyes", "laser"],
+        "laser": ["laser", "eyes"],
+    }
 
 
 @pytest.mark.parametrize("runs", [True], indirect=True)

@@ -124,7 +124,7 @@ def _label(options: argparse.Namespace, words: Sequence[str]) -> None:
 def _table(table: Table) -> str:
     """Return the scene table as an override of the configuration."""
     rows = ",".join(f"{scene}:[{','.join(modules)}]" for scene, modules in table.items())
-    return f'"scenes={{{rows}}}"'
+    return f'"+scenes={{{rows}}}"'
 
 
 def _told(judged: Sequence[Judged], otherwise: str) -> list[str]:
