@@ -123,7 +123,9 @@ def _proposal(words: Sequence[str], rig: Rig, *, is_live: bool) -> Iterator[str]
     if scenario is None:
         yield "no SLAM module can run on this"
         return
-    more = ["run=live", "+sinks@sinks.ros2=ros2"] if is_live else []
+    more = ["run=live"] if is_live else []
+    if is_live and [word for word in words if word.startswith("source=")][-1] == "source=ros2":
+        more.append("+sinks@sinks.ros2=ros2")
     yield "run it with:"
     yield "  " + " ".join(["python -m sceneslam", scenario, *words, *more])
 

@@ -10,7 +10,9 @@ import pytest
 from ros_recordings import STAMP_NS, Recorder
 from test_source_ros2 import ALL, IMAGE, Robot, talking
 
+from sceneslam import doctor
 from sceneslam.doctor import examine
+from sceneslam.script import composed
 from sceneslam.sources.ros2 import source as ros2
 from sceneslam.types.errors import ConfigError, InputError
 
@@ -42,6 +44,17 @@ def test_robot_with_a_laser_alone_is_told_what_others_lack(monkeypatch):
     said = listen(monkeypatch, "/scan", "/odom")
     assert "rgbd         lacks image and depth" in said and "laser        can run" in said
     assert "+scenario=single slam@slam.only=laser" in said
+
+
+@pytest.mark.parametrize(("name", "sinks"), [("ros2", ["+sinks@sinks.ros2=ros2"]), ("camera", [])])
+def test_only_a_robot_with_ros_is_proposed_a_sink_for_it(monkeypatch, name, sinks):
+    robot = Robot(*ALL)
+    monkeypatch.setattr(ros2, "open_transport", lambda network: robot)
+    other = composed(ROBOT, None)  # a camera that is live, without ROS
+    monkeypatch.setattr(doctor, "composed", lambda words, folder: other)
+    with talking(robot):
+        command = examine((f"source={name}",))[-1].split()
+    assert command[3:] == ["+scenario=bright_to_dark", f"source={name}", "run=live", *sinks]
 
 
 def test_recording_is_examined_alike(tmp_path):
