@@ -140,11 +140,12 @@ def _said(error: Exception) -> str:
 
 def _without_advice(error: HydraException) -> str:
     """Return Hydra's message without misleading advice."""
+    said = re.sub(r"use \+(slam|sinks)=", r"use +\1@\1.KEY=", str(error))  # each has a key
     missing = str(getattr(error.__cause__, "full_key", None) or "of that name")
     if takes_rows(getattr(error.__cause__, "parent_node", None)):
-        return str(error)
+        return said
     there = f"There is no key {missing}; --cfg job shows all"
-    return re.sub(r"To append to your config use \+(.*)", there, str(error))
+    return re.sub(r"To append to your config use \+(.*)", there, said)
 
 
 def _meant(error: Exception) -> str | None:

@@ -59,6 +59,8 @@ def test_run_says_what_happened_in_ten_lines_at_most(folder):
         ((*SINGLE, "policy={typo: 1}"), "There is no key policy.typo"),
         ((*SINGLE, "scenes={Dark: [only]}"), "use +scenes={Dark: [only]}"),
         ((*SINGLE, "evaluation.scenes={Hall: Any}"), "use +evaluation.scenes={Hall: Any}"),
+        ((*SINGLE, "slam=process"), "use +slam@slam.KEY=process"),
+        ((*SINGLE, "sinks=mcap"), "use +sinks@sinks.KEY=mcap"),
         ((*SINGLE, "policy.gate=null", "sinks=null"), "error: sinks=null: a group holds options"),
         ((*SINGLE, "scenes.Any=[onyl]"), "scenes.Any: got ['onyl']"),
         (

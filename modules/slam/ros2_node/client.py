@@ -1,4 +1,4 @@
-"""The program between `slam=process` and ROS 2: publishes sensors, receives poses and maps."""
+"""The program between `process` and ROS 2: publishes sensors, receives poses and maps."""
 
 from __future__ import annotations
 

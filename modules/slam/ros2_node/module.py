@@ -1,6 +1,6 @@
 """The `ros2_node` SLAM module: any ROS 2 SLAM node, as the paper used ROS nodes.
 
-The node is started by a program that uses the protocol of `slam=process` on one side and ROS 2 over
+The node is started by a program that uses the protocol of `process` on one side and ROS 2 over
 DDS on the other. Deadlines, restarts and late poses are handled by `process`.
 """
 
