@@ -10,6 +10,8 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+import yaml
+from documentation import ROOT, write_files
 
 from sceneslam.modules.slam.cloud_map import CloudMap
 from sceneslam.modules.slam.cloud_odometry import CloudOdometry
@@ -71,6 +73,13 @@ def driven(answers, *, odometry=True, **settings):
     silent = {} if odometry else {"T_odom_base": None}
     found = [module.track(replace(room_observation(index), **silent)) for index in range(8)]
     return found, module.library
+
+
+def test_the_settings_that_the_guide_shows_make_a_module(tmp_path):
+    write_files(ROOT / "docs" / "own_module.md", tmp_path)
+    settings = yaml.safe_load((tmp_path / "my_conf" / "slam" / "my_icp.yaml").read_text())
+    del settings["_target_"]
+    Around(**settings).activate(RIG)
 
 
 @pytest.mark.parametrize(
