@@ -133,6 +133,14 @@ def test_ports_of_the_viewer_are_checked():
         Viewer(port=9876, web_port=80)
 
 
+def test_without_a_display_the_key_for_a_page_is_named(monkeypatch):
+    monkeypatch.setattr("sys.platform", "linux")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(ConfigError, match=r"as sinks\.live\.viewer\.web_port=9090: there is no"):
+        Viewer(port=free_ports(1)[0], web_port=None).open()
+
+
 def test_a_port_that_something_else_listens_on_is_no_port_for_a_page():
     with socket.create_server(("127.0.0.1", 0)) as other:
         taken, (free,) = other.getsockname()[1], free_ports(1)

@@ -13,6 +13,7 @@ from sceneslam.types.errors import ConfigError
 
 HOST = "127.0.0.1"  # only this machine can connect
 _STARTS_WITHIN_S = 30.0
+_AS_A_PAGE = "sinks.live.viewer.web_port=9090"  # where viewer=rerun has it
 _log = logging.getLogger(__name__)
 
 
@@ -61,7 +62,8 @@ class Viewer:
         is_linux = sys.platform.startswith("linux")
         has_display = bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
         if self._web_port is None and is_linux and not has_display:
-            raise ConfigError("web_port", None, "a port, as 9090: there is no display for a window")
+            allowed = f"a port, as {_AS_A_PAGE}: there is no display for a window"
+            raise ConfigError("web_port", None, allowed)
 
     def _command(self) -> list[str]:
         command = [sys.executable, "-m", "rerun", "--bind", HOST, "--port", str(self._port)]
@@ -74,7 +76,7 @@ class Viewer:
         until_s = monotonic() + _STARTS_WITHIN_S
         while not _listens(self._port):
             if self.process.poll() is not None or monotonic() > until_s:
-                allowed = "a port on which the viewer can start; without a display: web_port=9090"
+                allowed = f"a port on which the viewer can start; without a display: {_AS_A_PAGE}"
                 raise ConfigError("port", self._port, allowed)
             sleep(0.05)
 

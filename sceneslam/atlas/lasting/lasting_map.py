@@ -35,10 +35,10 @@ class LastingMap:
             raise ConfigError("mode", mode, f"{LOCALIZE} | {EXTEND} | {UPDATE}")
         if mode == LOCALIZE and save is not None:
             raise ConfigError(
-                "save", save, f"null where mode is {LOCALIZE}: the map stays as it is"
+                "save", save, f"null where atlas.mode is {LOCALIZE}: the map stays as it is"
             )
         if mode != EXTEND and load is None:
-            raise ConfigError("mode", mode, f"{EXTEND} where no map is loaded (load=FOLDER)")
+            raise ConfigError("mode", mode, f"{EXTEND} where no map is loaded (atlas.load=FOLDER)")
         if not save_every_s > 0:
             raise ConfigError("save_every_s", save_every_s, "seconds above 0")
         self._mode, self._every_ns = mode, round(save_every_s * 1e9)
