@@ -93,10 +93,11 @@ def as_run_here(command: str) -> list[str]:
 
 def run(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
     """Run a command of the documentation in a folder, in a process of its own."""
+    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])  # as activated
     return subprocess.run(
         as_run_here(command),
         cwd=folder,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        env=os.environ | {"PYTHONPATH": str(ROOT), "PATH": path},
         capture_output=True,
         text=True,
         timeout=300,
