@@ -373,7 +373,11 @@ class Sink(Protocol):
         ...
 
     def write(self, observation: Observation, T_map_base: Transform | None, module: str) -> None:
-        """Write an observation with T_map_base (4, 4) [m] (None: no pose) and active module."""
+        """Write an observation with T_map_base (4, 4) [m] (None: no pose).
+
+        `module` is the key of the active module, also while it is lost and the pose is bridged; ""
+        where no module is active.
+        """
         ...
 
     def write_event(self, event: Event) -> None:
