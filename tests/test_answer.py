@@ -8,11 +8,12 @@ from evaluation_runs import SETTINGS, poseless_run, switched_run, true_loop
 from sceneslam.evaluation.metrics import evaluate
 from sceneslam.evaluation.names import module_names, renamed
 from sceneslam.evaluation.report.answer import answer
+from sceneslam.types.rig import Sensor
 
 
-def told(**changes):
+def told(source=(), **changes):
     metrics = evaluate(switched_run(), true_loop(), settings=SETTINGS)
-    return answer(metrics | changes, [])
+    return answer(metrics | changes, [], source)
 
 
 def test_a_good_run_is_told_in_one_sentence():
@@ -27,7 +28,7 @@ def test_a_good_run_is_told_in_one_sentence():
         ({"bridged_why": {"while dark was lost": 50}, "correct_rate": 0.7}, "[dark,OTHER]"),
         ({"bridged_why": {"while dark was rejected": 50}}, "policy.gate=null"),
         ({"bridged_why": {"after a module failed": 50}}, "run.isolation=process"),
-        ({"missing_why": {"without depth": 120}}, "no depth at these"),
+        ({"missing_why": {"without depth": 120}}, "without depth. Look at the sensor."),
         ({"missing_why": {"before a module tracked": 120}}, "came late"),
         ({"false_switches": 3}, "detector.threshold"),
     ],
@@ -50,13 +51,22 @@ def test_a_run_that_worked_in_part_says_where(changes, where):
     assert found.kind == "partly" and where in " ".join(found.where)
 
 
+@pytest.mark.parametrize("sensor", [sensor.words for sensor in Sensor])
+def test_a_tolerance_is_named_where_the_source_has_one(sensor):
+    missing = {"missing_why": {f"without {sensor}": 120}}
+    (without,) = told(source=("path",), **missing).advice
+    (within,) = told(source=("path", "sync_tolerance_s"), **missing).advice
+    assert without == f"At these times the module was without {sensor}. Look at the sensor."
+    assert "sensor, or at source.sync_tolerance_s where" in within
+
+
 def test_few_bridged_poses_ask_for_no_change():
     assert not told(bridged_why={"while dark was lost": 1}).advice
 
 
 def test_a_run_without_a_pose_did_not_work():
     metrics = evaluate(poseless_run(observed=10), None, settings=SETTINGS)
-    found = answer(metrics, ["the source ended early"])
+    found = answer(metrics, ["the source ended early"], ())
     assert found.kind == "failed" and found.where == ["the source ended early"]
 
 

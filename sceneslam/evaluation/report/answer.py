@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from sceneslam.evaluation.metrics import Metrics
@@ -34,10 +34,11 @@ _ADVICE = (  # part of the reason for a missing pose -> advice
     ),
     (
         r"without (.+)",
-        "There was no {0} at these times. Look at the sensor, or at source.sync_tolerance_s where "
-        "its stamps lie apart from the images'.",
+        "At these times the module was without {0}. Look at the sensor{or_tolerance}.",
     ),
 )
+
+_OR_TOLERANCE = ", or at source.sync_tolerance_s where its stamps lie apart from the images'"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,10 +51,13 @@ class Answer:
     advice: Sequence[str]  # what to change
 
 
-def answer(metrics: Metrics, faults: Sequence[str]) -> Answer:
-    """Return whether a run worked; `faults`: errors of the input, or why the run ended early."""
+def answer(metrics: Metrics, faults: Sequence[str], source: Collection[str]) -> Answer:
+    """Return whether a run worked.
+
+    `faults` are errors of the input, or why the run ended early; `source` the keys of the source.
+    """
     where = list(dict.fromkeys([*faults, *metrics["shortfalls"]]))
-    advice = [*dict.fromkeys(_advice(metrics))]
+    advice = [*dict.fromkeys(_advice(metrics, source))]
     if not metrics["poses"]:
         return Answer(kind="failed", headline="It did not work.", where=where, advice=advice)
     rate, false = metrics["correct_rate"], metrics["false_switches"]
@@ -72,15 +76,16 @@ def answer(metrics: Metrics, faults: Sequence[str]) -> Answer:
     return Answer(kind="worked", headline=f"It worked: {summary}.", where=[], advice=advice)
 
 
-def _advice(metrics: Metrics) -> Iterator[str]:
+def _advice(metrics: Metrics, source: Collection[str]) -> Iterator[str]:
     """Yield advice on the most frequent causes of missing poses, then on wrong switches."""
+    or_tolerance = _OR_TOLERANCE if "sync_tolerance_s" in source else ""
     least = _SHARE * metrics["observations"]
     for reason, count in _reasons(metrics).items():
         if count < least:
             continue
         for pattern, advice in _ADVICE:
             if match := re.fullmatch(pattern, reason):
-                yield advice.format(*match.groups())
+                yield advice.format(*match.groups(), or_tolerance=or_tolerance)
                 break
     if metrics["false_switches"]:
         yield (

@@ -80,7 +80,7 @@ def write_report(
     entries = chronicle(result, metrics["switches"], value_label=value_label)
     values = {
         **_told(metrics),
-        "answer": _answer(answer(metrics, faults)),
+        "answer": _answer(answer(metrics, faults, config.get("source") or ())),
         "title": escape(_titled(title, config)),
         "made_of": markup.bullets(_made_of(config)),
         "faults": _faults(_amiss(metrics)),
