@@ -14,6 +14,7 @@ from sceneslam.types.se3 import Transform
 
 from ..see.corners import LEVELS, SCALE
 from ..see.features import Features
+from ..see.lens import undistorted_bounds
 from .keyframes import NO_LANDMARK, Keyframe, KeyframeStore
 from .landmarks import LandmarkTable, Looks
 from .shifts import learn_shifts
@@ -61,6 +62,7 @@ class VisualMap:
     ) -> None:
         self.landmarks, self.keyframes = LandmarkTable(), KeyframeStore()
         self.camera, self.depth_camera = camera, depth_camera
+        self._bounds_px = undistorted_bounds(camera)
         self._sigma_px, self.inverse_depth_sigma_per_m = sigma_px, inverse_depth_sigma_per_m
         self._keyframe_limit, self._landmark_limit = keyframe_limit, landmark_limit
         self.corrections = 0  # how often keyframes were moved
@@ -117,13 +119,14 @@ class VisualMap:
         u, v = camera.fx * x * inverse_z + camera.cx, camera.fy * y * inverse_z + camera.cy
         turned_away = (away * normals).sum(axis=0)  # minus the cosine, times the distance
         levels = np.log(table.reach_m.take(landmark_ids) / distance_m) / np.log(SCALE)
+        least_px, most_px = self._bounds_px
         visible = np.flatnonzero(
             (z > _NEAREST_M)
             & (turned_away < -_MIN_COS_VIEW * distance_m)
-            & (u >= 0)
-            & (u <= camera.size_wh[0])
-            & (v >= 0)
-            & (v <= camera.size_wh[1])
+            & (u >= least_px[0])
+            & (u <= most_px[0])
+            & (v >= least_px[1])
+            & (v <= most_px[1])
             & (levels > -1.5)
             & (levels < LEVELS + 0.5)
         )
