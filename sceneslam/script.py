@@ -13,7 +13,7 @@ from hydra.errors import HydraException, OverrideParseException
 from sceneslam import app
 from sceneslam.config.check import check_no_reference, first_line
 from sceneslam.config.resolve import resolved
-from sceneslam.config.words import check_trust, how_to_quote
+from sceneslam.config.words import check_trust, how_to_quote, quoted, readable
 from sceneslam.storage.folder import RunFolder, give_back
 from sceneslam.types.errors import ConfigError, SceneSlamError
 
@@ -26,6 +26,7 @@ def run(
     """Run a configuration as the command line does; write its folder and return the result.
 
     `overrides` are words of the command line: `"+scenario=bright_to_dark", "source.path=FOLDER"`.
+    Paths need no quotes there, also with blanks.
     `folder` is the folder of the results (`outputs/DATE/TIME`), `config_dir` a folder of your own
     configurations. Sweeps (`-m`), experiments and `reference` need the command line.
 
@@ -48,12 +49,12 @@ def run(
 
 def composed(overrides: tuple[str, ...], config_dir: str | Path | None) -> dict[str, object]:
     """Return the resolved configuration; raises ConfigError if it cannot be composed."""
-    words = [*overrides]
+    words = [readable(word, is_sweep=False) for word in overrides]
     if config_dir is not None:
         path = Path(config_dir).resolve()
         if not path.is_dir():
             raise ConfigError("config_dir", str(config_dir), "a folder that exists")
-        words.append(f"hydra.searchpath=['file://{path}']")
+        words.append(f"hydra.searchpath=[{quoted(f'file://{path}')}]")
     GlobalHydra.instance().clear()  # a notebook may have initialised it before
     try:
         with initialize_config_module("sceneslam.conf", version_base="1.3"):
@@ -64,7 +65,7 @@ def composed(overrides: tuple[str, ...], config_dir: str | Path | None) -> dict[
     except HydraException as error:
         allowed = f"overrides that compose ({first_line(error)})"
         raise ConfigError("overrides", list(overrides), allowed) from error
-    check_trust(config, list(overrides))
+    check_trust(config, words)
     return resolved(config)
 
 

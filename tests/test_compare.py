@@ -80,7 +80,7 @@ def test_a_script_gets_the_run_as_arrays(runs):
     [
         (("+scenario=nowhere",), "scenario/nowhere"),
         (("policy.typo=1",), "policy.typo"),
-        (("source.path=a(b",), "quotes"),
+        (("story=a(b",), "quotes"),
         (("+experiment=faults",), "experiment"),
         ((*WORDS, "source.path=x.mcap", "detector._target_=os.system"), "os.system"),
     ],

@@ -18,6 +18,7 @@ from sceneslam.app import run
 from sceneslam.config.check import check_node
 from sceneslam.config.files import check_yaml
 from sceneslam.config.words import check_trust, how_to_quote, readable, takes_rows
+from sceneslam.script import composed
 from sceneslam.sources.bag.open_recording import open_recording
 from sceneslam.sources.tum_rgbd import TumRgbd
 from sceneslam.types.errors import ConfigError, InputError
@@ -57,6 +58,15 @@ def call(folder, *words, **more):
 def test_path_is_read_as_it_is_typed(path):
     word = readable(f"source.path={path}", is_sweep=False)
     assert OverridesParser.create().parse_override(word).value() == path
+
+
+@pytest.mark.parametrize("path", ["~/x.bag", "/x/scan (1).bag", "/x/it's.bag", "/x/a,b.bag"])
+def test_a_script_gives_paths_as_the_command_line_does(tmp_path, path):
+    own = tmp_path / "it's mine" / "policy"
+    own.mkdir(parents=True)
+    (own / "mine.yaml").write_text("defaults: [default]\nretry_s: 7.0\n")
+    config = composed(("source=rosbag", f"source.path={path}", "policy=mine"), own.parent)
+    assert config["source"]["path"] == path and config["policy"]["retry_s"] == 7.0
 
 
 @pytest.mark.parametrize(
