@@ -383,6 +383,34 @@ def test_sensors_that_no_transform_places_are_named(
         assert alone.survey().unplaced == []
 
 
+@pytest.mark.parametrize(
+    ("frame", "is_connected", "gyro_base", "unplaced"),
+    [
+        ("gyro", True, [-2.0, 1.0, 3.0], []),  # as the camera's transforms say
+        ("gyro", False, [1.0, 2.0, 3.0], ["cam", "gyro"]),
+        ("imu_optical_frame", False, [3.0, -1.0, -2.0], ["cam", "imu_optical_frame"]),
+    ],
+)
+def test_imu_of_a_camera_without_a_robot_has_the_cameras_axes(
+    tmp_path: Path, frame: str, is_connected: bool, gyro_base: list[float], unplaced: list[str]
+) -> None:
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        if is_connected:
+            children = {"cam": optical_to_rep103(), frame: se3.from_xy_yaw(0.01, 0.02, np.pi / 2)}
+            data = Encoder().transforms(STAMP_NS, "camera_link", children)
+            recorder.add("/tf_static", 0, store.deserialize_cdr(data, "tf2_msgs/msg/TFMessage"))
+        for stamp_ns in (STAMP_NS, STAMP_NS + 10**7):
+            data = Encoder().imu(stamp_ns, {Sensor.GYRO: np.array([1.0, 2.0, 3.0])})
+            message = store.deserialize_cdr(data, "sensor_msgs/msg/Imu")
+            message.header.frame_id = frame
+            recorder.add("/imu", stamp_ns, message)
+            recorder.image("/rgb", stamp_ns, COLOR, "bgr8")
+    source = make_source("mcap", tmp_path / "a.mcap")
+    np.testing.assert_allclose(list(source)[-1].gyro_base[-1, 1:], gyro_base, atol=1e-12)
+    assert source.survey().unplaced == unplaced
+
+
 def test_gyro_and_accelerometer_may_come_in_messages_of_their_own(tmp_path: Path) -> None:
     store = get_typestore(Stores.ROS2_HUMBLE)
     samples = {

@@ -89,8 +89,9 @@ def place(recording: Recording, topic: str, frames: FrameTree) -> Transform:
 
 
 def unplaced(recording: Recording, topics: BagTopics, frames: FrameTree) -> list[str]:
-    """Return the frames of sensors that no transform connects with the base."""
-    chosen = (topics.image or topics.depth, topics.scan, topics.points, topics.imu)
+    """Return the frames of sensors that no transform places; another sensor may place an IMU."""
+    imu = topics.imu if _T_base_imu(recording, topics, frames) is None else None
+    chosen = (topics.image or topics.depth, topics.scan, topics.points, imu)
     return unconnected(recording, [topic for topic in chosen if topic], frames)
 
 
@@ -120,8 +121,15 @@ def unregistered(recording: Recording, topics: BagTopics, frames: FrameTree) -> 
 
 
 def find_mounts(recording: Recording, topics: BagTopics, frames: FrameTree) -> Mounts:
-    """Return the poses of the IMU and of odometry's frame; identity where they are not recorded."""
-    T_base_imu = place(recording, topics.imu, frames) if topics.imu else se3.identity()
+    """Return the poses of the IMU and of odometry's frame; identity where they are not recorded.
+
+    An optical frame of unknown pose looks along x, as a camera does.
+    """
+    T_base_imu = _T_base_imu(recording, topics, frames)
+    if T_base_imu is None:
+        imu = first(recording, topics.imu) if topics.imu else None
+        is_optical = imu is not None and decode.frame_id(imu).endswith("_optical_frame")
+        T_base_imu = optical_to_rep103() if is_optical else se3.identity()
     message = first(recording, topics.odometry) if topics.odometry else None
     child = "" if message is None else decode.child_frame_id(message)
     T_base_child = frames.T_base(child) if child else None
@@ -142,6 +150,28 @@ def picture_size_wh(recording: Recording, topics: BagTopics) -> tuple[int, int]:
         if picture is not None:
             return int(picture.shape[1]), int(picture.shape[0])
     raise InputError(f"none of the images of {topic} can be decoded")
+
+
+def _T_base_imu(recording: Recording, topics: BagTopics, frames: FrameTree) -> Transform | None:
+    """Return T_base_imu (4, 4) [m], None if no transform connects the IMU with the base.
+
+    Nor with a sensor that sits in base without transforms: a lidar, a laser, a camera ahead.
+    """
+    imu = first(recording, topics.imu) if topics.imu else None
+    if imu is None:
+        return None
+    frame = decode.frame_id(imu)
+    T_base_imu = frames.T_base(frame)
+    for topic, T_base_sensor in (
+        (topics.points, se3.identity()),
+        (topics.scan, se3.identity()),
+        (topics.image or topics.depth, optical_to_rep103()),
+    ):
+        sensor = first(recording, topic) if topic and T_base_imu is None else None
+        if sensor is not None and decode.frame_id(sensor) != frame:
+            T_sensor_imu = frames.between(decode.frame_id(sensor), frame)
+            T_base_imu = None if T_sensor_imu is None else T_base_sensor @ T_sensor_imu
+    return T_base_imu
 
 
 def _camera(

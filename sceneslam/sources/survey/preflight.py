@@ -232,7 +232,7 @@ def _of_places(survey: Survey) -> Iterator[str]:
     for frame in survey.unplaced:
         yield (
             f"no transform connects frame {frame!r} with the robot's base (source.base_frame): its "
-            "sensor is taken to sit in base, a camera to look along x"
+            "sensor is taken to sit in base, a camera or optical frame to look along x"
         )
     yield from survey.odd
     for topic in survey.silent:
