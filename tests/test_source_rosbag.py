@@ -115,6 +115,17 @@ def test_two_candidates_for_the_image_have_to_be_chosen_from(tmp_path: Path) -> 
     assert len(list(source)) == 3
 
 
+@pytest.mark.parametrize(("topic", "range_m"), [("/front/scan", 1.0), ("/rear/scan", 2.0)])
+def test_one_of_two_lasers_can_be_chosen(tmp_path: Path, topic: str, range_m: float) -> None:
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        recorder.scan("/front/scan", STAMP_NS, [1.0])
+        recorder.scan("/rear/scan", STAMP_NS, [2.0])
+    with pytest.raises(InputError, match=r"source\.topics\.scan=/front/scan"):
+        make_source("mcap", tmp_path / "a.mcap")
+    (one,) = make_source("mcap", tmp_path / "a.mcap", topics={"scan": topic})
+    assert one.scan.ranges_m[0] == range_m
+
+
 def test_colour_is_preferred_to_infrared_and_raw_to_compressed(tmp_path: Path) -> None:
     infrared = COLOR[..., 0]
     path = record(tmp_path / "a.mcap", infra__image=(infrared, "mono8"), rgb__image=(COLOR, "rgb8"))

@@ -75,8 +75,8 @@ def choose_topics(recording: Recording, given: Mapping[str, str | None]) -> BagT
         "ground_truth": [n for n in _of_type(recording, _POSES) if _is_truth(n)],
         "scene": [n for n in _of_type(recording, TYPES["scene"]) if _is_truth(n)],
     }
-    for need, candidates in found.items():
-        chosen.setdefault(need, _only(need, candidates))
+    for need in [need for need in found if need not in chosen]:
+        chosen[need] = _only(need, found[need])
     picture = chosen["image"] if chosen["image"] != NONE else chosen["depth"]
     if "camera_info" not in chosen:
         chosen["camera_info"] = _camera_info(recording, picture)
