@@ -10,6 +10,8 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from rosbags.typesys import Stores, get_typestore
 
 from sceneslam.ros.encode import Encoder
+from sceneslam.sources.bag.open_recording import open_recording
+from sceneslam.sources.bag.topics import inertial_sensors
 from sceneslam.sources.survey.preflight import preflight
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError, InputError
@@ -443,6 +445,47 @@ def test_gyro_and_accelerometer_may_come_in_messages_of_their_own(tmp_path: Path
     survey = source.survey()
     np.testing.assert_allclose(survey.gyro_radps[0], samples[Sensor.GYRO])
     assert survey.stream(Sensor.GYRO).rate_hz == pytest.approx(100.0)
+
+
+def record_imus(path: Path, turned_from: int = 0, **vectors: list[float]) -> Path:
+    """Write 400 Imu messages to /NAME/sample each: gyro and accelerometer, six numbers.
+
+    As RealSense's driver does it, none says that a vector is missing. Before the message
+    `turned_from` the gyro is zero.
+    """
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    with Recorder(path) as recorder:
+        for number in range(400):
+            stamp_ns = STAMP_NS + number * 10**7
+            recorder.scan("/scan", stamp_ns, [1.0])
+            for topic, vector in vectors.items():
+                gyro = np.array(vector[:3]) if number >= turned_from else np.zeros(3)
+                measured = {Sensor.GYRO: gyro, Sensor.ACCELEROMETER: np.array(vector[3:])}
+                data = Encoder().imu(stamp_ns, measured)
+                message = store.deserialize_cdr(data, "sensor_msgs/msg/Imu")
+                recorder.add(f"/{topic}/sample", stamp_ns, message)
+    return path
+
+
+def test_half_of_a_split_imu_that_is_zero_is_not_measured(tmp_path: Path) -> None:
+    path = record_imus(tmp_path / "a.mcap", accel=[0, 0, 0, 0, 0, 9.8], gyro=[0, 0, 0.1, 0, 0, 0])
+    with pytest.raises(InputError, match=r"several .*source\.topics\.imu=/gyro/sample"):
+        make_source("mcap", path)
+    for topic, sensor in (("gyro", Sensor.GYRO), ("accel", Sensor.ACCELEROMETER)):
+        source = make_source("mcap", path, topics={"imu": f"/{topic}/sample"})
+        assert source.rig.sensors == {Sensor.SCAN, sensor}
+        live = inertial_sensors(open_recording(path), f"/{topic}/sample", is_live=True)
+        assert live == {sensor}
+
+
+@pytest.mark.parametrize(("turned_from", "is_gyro"), [(0, True), (330, True), (400, False)])
+def test_gyro_of_a_simulated_robot_may_be_zero_at_rest(
+    tmp_path: Path, turned_from: int, is_gyro: bool
+) -> None:
+    path = record_imus(tmp_path / "a.mcap", turned_from, imu=[0, 0, 0.1, 0, 0, 9.8])
+    assert (Sensor.GYRO in make_source("mcap", path).rig.sensors) == is_gyro
+    both = {Sensor.GYRO, Sensor.ACCELEROMETER}  # it may turn later
+    assert inertial_sensors(open_recording(path), "/imu/sample", is_live=True) == both
 
 
 def test_without_transforms_the_camera_looks_ahead(tmp_path: Path) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,7 @@ from sceneslam.ros import decode, names, pixels
 from sceneslam.sources.bag.frames import FrameTree
 from sceneslam.sources.bag.observation import Mounts
 from sceneslam.sources.bag.recording import Recording
-from sceneslam.sources.bag.topics import BagTopics, first, infos_of
+from sceneslam.sources.bag.topics import BagTopics, first, inertial_sensors, infos_of
 from sceneslam.sources.intrinsics import Intrinsics
 from sceneslam.types import se3
 from sceneslam.types.errors import InputError
@@ -31,7 +30,6 @@ _NEEDS = {  # sensor -> field of BagTopics that names its topic
     Sensor.ACCELEROMETER: "imu",
 }
 _RECTIFIED = "image_rect"  # in the topics of image_proc and stereo_image_proc
-_FIRST_IMU = 100  # messages searched for both sensors, which may come in messages of their own
 _DEPTH_RANGE_M, _LIDAR_RANGE_M = (0.3, 8.0), (1.0, 100.0)
 
 
@@ -45,16 +43,12 @@ class Given:
     wheels: Wheels
 
 
-def sensor_topics(recording: Recording, topics: BagTopics) -> dict[Sensor, str]:
+def sensor_topics(
+    recording: Recording, topics: BagTopics, *, is_live: bool = False
+) -> dict[Sensor, str]:
     """Return the topic of each recorded sensor; one Imu topic can be gyro and accelerometer."""
     chosen = {sensor: getattr(topics, need) for sensor, need in _NEEDS.items()}
-    measured: set[Sensor] = set()
-    if topics.imu:
-        for message in islice(recording.messages({topics.imu}), _FIRST_IMU):
-            imu = recording.decode(message)
-            measured |= set() if imu is None else decode.inertial(imu).keys()
-            if len(measured) == 2:
-                break
+    measured = inertial_sensors(recording, topics.imu, is_live=is_live) if topics.imu else set()
     return {
         sensor: name
         for sensor, name in chosen.items()

@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
+import numpy as np
+
 from sceneslam.ros import decode, names
-from sceneslam.sources.bag.recording import Recording
+from sceneslam.sources.bag.recording import Message, Recording
 from sceneslam.types.errors import ConfigError, InputError
+from sceneslam.types.rig import Sensor
 
 _log = logging.getLogger(__name__)
 NONE = "none"  # as a topic's name: the sensor is not used
+_FIRST_IMU = 100  # messages searched for both sensors, which may come in messages of their own
+_LATER_IMU = 20  # messages at each of so many times, where a vector of all of these is zero
 _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _POSES = (
     "nav_msgs/msg/Odometry",
@@ -70,7 +76,8 @@ def choose_topics(recording: Recording, given: Mapping[str, str | None]) -> BagT
     found = {
         "image": _without_grey(_one_transport(colors), firsts),
         "depth": _prefer(_one_transport(depths), lambda name: "align" in name or "regist" in name),
-        **{need: _of_type(recording, TYPES[need]) for need in ("scan", "points", "imu")},
+        **{need: _of_type(recording, TYPES[need]) for need in ("scan", "points")},
+        "imu": [] if "imu" in chosen else _gyros_first(recording),
         "odometry": [n for n in _of_type(recording, TYPES["odometry"]) if not _is_truth(n)],
         "ground_truth": [n for n in _of_type(recording, _POSES) if _is_truth(n)],
         "scene": [n for n in _of_type(recording, TYPES["scene"]) if _is_truth(n)],
@@ -90,6 +97,33 @@ def first(recording: Recording, topic: str) -> Any:
         if decoded is not None:
             return decoded
     return None
+
+
+def inertial_sensors(
+    recording: Recording, topic: str, *, is_live: bool = False
+) -> Collection[Sensor]:
+    """Return which of gyro and accelerometer an Imu topic measures, by samples of its messages.
+
+    A vector is missing if its covariance says so, or if it is exactly zero in all samples and the
+    other one is not: RealSense's driver publishes both apart. A simulated robot that stands still
+    measures no turn either, but may turn later: a gyro that is zero so far is taken to be one in a
+    live recording, unless the topic is named as an accelerometer.
+    """
+    said: set[Sensor] = set()
+    moved: set[Sensor] = set()
+    for message in _spread_messages(recording, topic):
+        imu = recording.decode(message)
+        vectors = {} if imu is None else decode.inertial(imu)
+        said |= vectors.keys()
+        moved |= {sensor for sensor, vector in vectors.items() if vector.any()}
+        if len(moved) == 2:
+            break
+    silent = said - moved if moved else set()
+    if is_live and "accel" not in topic:
+        silent -= {Sensor.GYRO}
+    for sensor in silent:
+        _log.warning("%s holds no %s, only zeros", topic, sensor.value)
+    return said - silent
 
 
 def infos_of(recording: Recording, picture: str) -> list[str]:
@@ -154,6 +188,25 @@ def _without_grey(topics: Sequence[str], firsts: Mapping[str, Any]) -> list[str]
 def _prefer(topics: Sequence[str], is_better: Callable[[str], bool]) -> list[str]:
     """Return the topics for which `is_better` holds; if there are none, all."""
     return [name for name in topics if is_better(name)] or list(topics)
+
+
+def _gyros_first(recording: Recording) -> list[str]:
+    """Return the Imu topics; of several, those with a gyro first, as bridging needs the turns."""
+    imus = _of_type(recording, TYPES["imu"])
+    if len(imus) < 2:
+        return imus
+    return sorted(imus, key=lambda name: Sensor.GYRO not in inertial_sensors(recording, name))
+
+
+def _spread_messages(recording: Recording, topic: str) -> Iterator[Message]:
+    """Yield a topic's first messages, then some from its whole time."""
+    message: Message | None = None
+    for message in islice(recording.messages({topic}), _FIRST_IMU):
+        yield message
+    last = recording.last(topic)
+    if message is not None and last is not None:
+        for at_ns in np.linspace(message.log_ns, last.log_ns, _LATER_IMU).tolist():
+            yield from islice(recording.messages({topic}, int(at_ns)), _LATER_IMU)
 
 
 def _camera_info(recording: Recording, picture: str) -> str:

@@ -186,7 +186,7 @@ class Ros2(Measuring):
         chosen = {need: self._name(need, name) for need, name in self._named.items()}
         try:
             self.topics = choose_topics(heard, chosen)
-            self._by_sensor = sensor_topics(heard, self.topics)
+            self._by_sensor = sensor_topics(heard, self.topics, is_live=True)
             if not any(sensor in self._by_sensor for sensor in PRIMARY):
                 raise InputError("no image, depth, points, scan or odometry")
             self.frames = FrameTree(heard, self._base_frame)
