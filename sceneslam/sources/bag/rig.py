@@ -107,7 +107,7 @@ def unregistered(recording: Recording, topics: BagTopics, frames: FrameTree) -> 
     of_depth = infos_of(recording, topics.depth or "")[:1]
     infos = [first(recording, topic) for topic in (topics.camera_info, *of_depth) if topic]
     lenses = [decode.coefficients(info, "k") for info in infos if info is not None]
-    if is_apart or (len(lenses) == 2 and not np.allclose(*lenses)):
+    if is_apart or (len(lenses) == 2 and not np.allclose(lenses[0], lenses[1])):
         yield (
             f"{topics.depth} (frame {seen_in[1]!r}) has another lens or position than "
             f"{topics.image} (frame {seen_in[0]!r}): depth has to be registered to the images"
