@@ -182,5 +182,6 @@ def test_pair_off_its_point_is_uncertain_by_the_direction_of_two_beams(aside_m, 
 def test_points_between_two_beams_do_not_confirm_a_pose():
     two = two_far_beams(20.0)
     field = LikelihoodField(two, 0.05)
-    near, _, _ = _residuals(two, field, np.array([0.0, 0.15, 0.0]), 1.0)
+    pose = np.array([0.0, 0.15, 0.0])
+    near, _, _ = _residuals(two, field, _Pairs.of(two, field, pose), pose, 1.0)
     assert (near > 0.1).all()
