@@ -414,7 +414,7 @@ def test_a_run_whose_map_is_too_large_to_load_replaces_none(tmp_path):
 def test_a_run_that_localizes_saves_no_map(tmp_path):
     save_map_files(whole_map(), tmp_path)
     with pytest.raises(
-        ConfigError, match="save: got 'other', allowed: null where atlas.mode is localize"
+        ConfigError, match=r"save: got 'other', allowed: null where atlas\.mode is localize"
     ):
         LastingMap(load=str(tmp_path), save="other", mode="localize", save_every_s=1.0)
     assert len(LastingMap(load=str(tmp_path), save=str(tmp_path), mode="update", save_every_s=1.0)
