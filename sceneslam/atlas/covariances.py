@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from sceneslam.atlas.submaps.graph import LOADED, marginals
 from sceneslam.atlas.submaps.submap import LENGTH_M, TURN_RAD
-from sceneslam.atlas.uncertainty import MAPPED, Covariance, Drift, drifted
+from sceneslam.atlas.uncertainty import MAPPED, Covariance, Drift, drifted, motions
 from sceneslam.graphs.edge import Edge
 from sceneslam.types import se3
 from sceneslam.types.covariance import grown, semidefinite
@@ -148,10 +148,8 @@ def _difference(a: Trajectory, b: Trajectory) -> tuple[Covariance, float] | None
 
 def _moved(T_map_base: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the metres and radians (N, 2) driven up to each pose."""
-    steps = se3.inverse(T_map_base[:-1]) @ T_map_base[1:]
-    length_m = np.linalg.norm(steps[:, :3, 3], axis=1)
-    moved = np.column_stack([length_m, se3.rotation_angle_rad(steps)])
-    return np.cumsum(np.concatenate([np.zeros((len(T_map_base[:1]), 2)), moved]), axis=0)
+    begin = np.zeros((len(T_map_base[:1]), 2))
+    return np.cumsum(np.concatenate([begin, motions(T_map_base)]), axis=0)
 
 
 def _submaps(moved: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.types import se3
 from sceneslam.types.covariance import TRIANGLE, symmetric, triangle
 from sceneslam.types.files import replacing
 from sceneslam.types.trajectory import parse_stamp_ns, stamp_text
@@ -37,6 +38,13 @@ WHEELS = Drift(per_m=0.02, rad_per_m=0.01, rad_per_rad=0.02, rad_per_root=0.0)
 GYRO = Drift(per_m=0.02, rad_per_m=0.002, rad_per_rad=0.005, rad_per_root=0.0)
 # Constant velocity: the robot may have braked meanwhile.
 VELOCITY = Drift(per_m=0.5, rad_per_m=0.1, rad_per_rad=0.5, rad_per_root=0.0)
+
+
+def motions(T_map_base: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the length and the angle (N - 1, 2) [m, rad] of the motions between N poses."""
+    steps = se3.inverse(T_map_base[:-1]) @ T_map_base[1:]
+    length_m = np.linalg.norm(steps[:, :3, 3], axis=1)
+    return np.column_stack([length_m, se3.rotation_angle_rad(steps)])
 
 
 def drifted(drift: Drift, moved: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -77,11 +77,10 @@ def draw(scans: Sequence[tuple[Planar, KeyScan]]) -> FloorPlan:
         ray = np.zeros((rows, columns), np.uint8)
         _draw_rays(ray, start / CELL_M - low, end / CELL_M - low)
         misses += ray
-        cells = np.floor(end / CELL_M).astype(np.int64) - low
-        hits.reshape(-1)[np.unique(cells[:, 1] * columns + cells[:, 0])] += 1
+        hits.reshape(-1)[np.unique(_index(end, low, columns))] += 1
     points = np.concatenate(ends)
     turned = [line_normals(scan) @ planar.rotation(float(T[2])).T for T, scan in scans]
-    index, count, centres, normals = _binned(points, np.concatenate(turned), low, (rows, columns))
+    index, count, centres, normals = _binned(points, np.concatenate(turned), low, columns)
     least = 1 if len(scans) < 3 else 2
     hit, passed = hits.reshape(-1)[index], misses.reshape(-1)[index]
     is_wall = (count >= least) & (hit >= _HITS_PER_MISS * passed)
@@ -112,7 +111,7 @@ def join(placed: Sequence[tuple[Planar, FloorPlan]], *, newest_wins: bool = Fals
         free |= seen
         kept.append(np.concatenate(walls, axis=1))
     left = np.concatenate(kept)
-    index, _, centres, mean = _binned(left[:, :2], left[:, 2:], low, (rows, columns))
+    index, _, centres, mean = _binned(left[:, :2], left[:, 2:], low, columns)
     free.reshape(-1)[index] = False
     return _plan(centres, mean, free, low)
 
@@ -186,14 +185,13 @@ def _binned(
     points: NDArray[np.float64],
     normals: NDArray[np.floating],
     low: NDArray[np.int64],
-    shape: tuple[int, int],
+    columns: int,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
     """Return the cells that hold points (flat indices), how many, their mean and normal (P, 2).
 
     The normal is 0 if those of a cell disagree.
     """
-    cells = np.floor(points / CELL_M).astype(np.int64) - low
-    flat = cells[:, 1] * shape[1] + cells[:, 0]
+    flat = _index(points, low, columns)
     index, inverse, count = np.unique(flat, return_inverse=True, return_counts=True)
     size = len(index)
     sums = [np.bincount(inverse, points[:, axis], size) for axis in (0, 1)]
@@ -226,5 +224,10 @@ def _laid(
 def _at(
     image: NDArray[np.bool_], points: NDArray[np.float64], low: NDArray[np.int64]
 ) -> NDArray[np.bool_]:
+    return np.asarray(image.reshape(-1)[_index(points, low, image.shape[1])])
+
+
+def _index(points: NDArray[np.float64], low: NDArray[np.int64], columns: int) -> NDArray[np.int64]:
+    """Return the flat index (N,) of the cell of each point (N, 2) [m] in a grid from cell low."""
     cells = np.floor(points / CELL_M).astype(np.int64) - low
-    return np.asarray(image[cells[:, 1], cells[:, 0]])
+    return np.asarray(cells[:, 1] * columns + cells[:, 0])

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
 from threading import Lock
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.atlas.places.floor_plan import FloorPlan, draw
-from sceneslam.atlas.uncertainty import Covariance, Drift
+from sceneslam.atlas.uncertainty import Covariance, Drift, motions
 from sceneslam.scans.key_scan import KeyScan
 from sceneslam.types import planar, se3
 from sceneslam.types.covariance import grown
@@ -164,9 +163,7 @@ def _grown(poses: Sequence[KeyPose]) -> Covariance:
 
 def _moved(poses: Sequence[KeyPose]) -> NDArray[np.float64]:
     """Return the length and the angle (K - 1, 2) [m, rad] of the motions between K poses."""
-    steps = [se3.inverse(a.T_map_base) @ b.T_map_base for a, b in pairwise(poses)]
-    T = np.array(steps).reshape(-1, 4, 4)
-    return np.column_stack([np.linalg.norm(T[:, :3, 3], axis=1), se3.rotation_angle_rad(T)])
+    return motions(np.array([pose.T_map_base for pose in poses]))
 
 
 def _planar(first: KeyPose, second: KeyPose) -> Planar:
