@@ -12,6 +12,23 @@ Transform = NDArray[np.float64]  # (4, 4), rigid
 Vector = NDArray[np.float64]
 
 _SMALLEST_RAD = 1e-4  # below, the series' factors are constant to 1e-9
+_AXES = np.stack([np.cross(np.eye(3), axis) for axis in np.eye(3)]).reshape(3, 9)  # of `hat`
+
+
+def _outer_of_rotation() -> NDArray[np.float64]:
+    """Return M (9, 16): for a unit quaternion q (x, y, z, w) of R, 4 q q' = R M + I.
+
+    As R = M q q', it leads both ways (Shepperd, "Quaternion from rotation matrix", 1978).
+    """
+    M = np.zeros((3, 3, 4, 4))
+    for i, (j, k) in enumerate([(1, 2), (2, 0), (0, 1)]):
+        M[i, i, [i, j, k, 3], [i, j, k, 3]] = 1, -1, -1, 1
+        M[i, j, [i, j], [j, i]] = M[j, i, [i, j], [j, i]] = 1
+        M[k, j, [i, 3], [3, i]], M[j, k, [i, 3], [3, i]] = 1, -1
+    return M.reshape(9, 16)
+
+
+_OUTER_OF_ROTATION = _outer_of_rotation()
 
 
 def identity() -> Transform:
@@ -50,7 +67,7 @@ def inverse(T_a_b: Transform) -> Transform:
     rotation_t = np.swapaxes(T_a_b[..., :3, :3], -1, -2)
     T_b_a = np.zeros_like(T_a_b)
     T_b_a[..., :3, :3] = rotation_t
-    T_b_a[..., :3, 3] = -np.einsum("...ij,...j->...i", rotation_t, T_a_b[..., :3, 3])
+    T_b_a[..., :3, 3:] = -rotation_t @ T_a_b[..., :3, 3:]
     T_b_a[..., 3, 3] = 1.0
     return T_b_a
 
@@ -66,14 +83,9 @@ def rotation_angle_rad(T_a_b: Transform) -> NDArray[np.float64]:
 
     From sine and cosine together, which stays exact for angles near 0 and pi.
     """
-    r = T_a_b[..., :3, :3]
-    vee = np.stack(
-        [r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]],
-        axis=-1,
-    )
-    sine = 0.5 * np.linalg.norm(vee, axis=-1)
-    cosine = 0.5 * (np.trace(r, axis1=-2, axis2=-1) - 1.0)
-    return np.asarray(np.arctan2(sine, cosine))
+    r = T_a_b[..., :3, :3].reshape(*T_a_b.shape[:-2], 9)
+    twice_sine = np.linalg.norm(r[..., [7, 2, 3]] - r[..., [5, 6, 1]], axis=-1)
+    return np.asarray(np.arctan2(twice_sine, r[..., ::4].sum(axis=-1) - 1.0))
 
 
 def is_within(T_a_b: Transform, shift_m: float, turn_rad: float) -> bool:
@@ -84,9 +96,7 @@ def is_within(T_a_b: Transform, shift_m: float, turn_rad: float) -> bool:
 
 def hat(v: NDArray[np.floating]) -> NDArray[np.float64]:
     """Return the (..., 3, 3) matrices whose products with x are the cross products v x x."""
-    cross = np.zeros((*v.shape, 3))
-    cross[..., 2, 1], cross[..., 0, 2], cross[..., 1, 0] = v[..., 0], v[..., 1], v[..., 2]
-    return cross - np.swapaxes(cross, -1, -2)
+    return np.asarray(v @ _AXES).reshape(*v.shape, 3)
 
 
 def so3_exp(rotvec_rad: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -123,10 +133,18 @@ def exp(xi: NDArray[np.float64]) -> Transform:
 
 
 def log(T_a_b: Transform) -> NDArray[np.float64]:
-    """Return the twist (..., 6) of transforms: translation [m] first, then rotation [rad]."""
+    """Return the twist (..., 6) of transforms: translation [m] first, then rotation [rad].
+
+    The translation is by the closed inverse of the left Jacobian of SO(3) (Barfoot, "State
+    Estimation for Robotics", 2017, Eq. 7.37).
+    """
     phi = so3_log(T_a_b[..., :3, :3])
-    rho = np.linalg.solve(_left_jacobian(phi), T_a_b[..., :3, 3:])[..., 0]
-    return np.concatenate([rho, phi], axis=-1)
+    half = 0.5 * np.maximum(np.linalg.norm(phi, axis=-1), _SMALLEST_RAD)[..., None, None]
+    shift = T_a_b[..., :3, 3:]
+    across = hat(phi) @ shift
+    share = (1.0 - half / np.tan(half)) / (4.0 * half**2)
+    rho = shift - 0.5 * across + share * (hat(phi) @ across)
+    return np.concatenate([rho[..., 0], phi], axis=-1)
 
 
 def adjoint(T_a_b: Transform) -> NDArray[np.float64]:
@@ -168,17 +186,9 @@ def interpolate(T_w_0: Transform, T_w_1: Transform, ratio: float) -> Transform:
 def from_quat_xyzw(translation_m: NDArray[np.float64], quat_xyzw: NDArray[np.float64]) -> Transform:
     """Return T from (..., 3) translations [m] and (..., 4) quaternions, normalised here."""
     q = quat_xyzw / np.linalg.norm(quat_xyzw, axis=-1, keepdims=True)
-    x, y, z, w = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    outer = (q[..., :, None] * q[..., None, :]).reshape(-1, 16)
     T_a_b = np.zeros((*q.shape[:-1], 4, 4))
-    T_a_b[..., 0, :3] = np.stack(
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)], -1
-    )
-    T_a_b[..., 1, :3] = np.stack(
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)], -1
-    )
-    T_a_b[..., 2, :3] = np.stack(
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], -1
-    )
+    T_a_b[..., :3, :3] = (outer @ _OUTER_OF_ROTATION.T).reshape(*q.shape[:-1], 3, 3)
     T_a_b[..., :3, 3] = translation_m
     T_a_b[..., 3, 3] = 1.0
     return T_a_b
@@ -186,25 +196,14 @@ def from_quat_xyzw(translation_m: NDArray[np.float64], quat_xyzw: NDArray[np.flo
 
 def to_quat_xyzw(T_a_b: Transform) -> NDArray[np.float64]:
     """Return unit quaternions (..., 4) with w >= 0 of transforms (..., 4, 4)."""
-    r = T_a_b[..., :3, :3]
-    xx, yy, zz = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
-    # The four candidates of Shepperd's method; the largest diagonal term is the stable one.
-    rows = np.empty((*r.shape[:-2], 4, 4))
-    rows[..., 0, 0] = 1 + xx - yy - zz
-    rows[..., 1, 1] = 1 - xx + yy - zz
-    rows[..., 2, 2] = 1 - xx - yy + zz
-    rows[..., 3, 3] = 1 + xx + yy + zz
-    rows[..., 0, 1] = rows[..., 1, 0] = r[..., 0, 1] + r[..., 1, 0]
-    rows[..., 0, 2] = rows[..., 2, 0] = r[..., 0, 2] + r[..., 2, 0]
-    rows[..., 1, 2] = rows[..., 2, 1] = r[..., 1, 2] + r[..., 2, 1]
-    rows[..., 0, 3] = rows[..., 3, 0] = r[..., 2, 1] - r[..., 1, 2]
-    rows[..., 1, 3] = rows[..., 3, 1] = r[..., 0, 2] - r[..., 2, 0]
-    rows[..., 2, 3] = rows[..., 3, 2] = r[..., 1, 0] - r[..., 0, 1]
-    best = np.argmax(np.einsum("...ii->...i", rows), axis=-1)
-    flat = rows.reshape(-1, 4, 4)
-    quat = flat[np.arange(len(flat)), best.ravel()].reshape(*best.shape, 4)
-    quat = quat / np.linalg.norm(quat, axis=-1, keepdims=True)
-    return np.asarray(np.where(quat[..., 3:] < 0, -quat, quat))
+    shape = T_a_b.shape[:-2]
+    outer = T_a_b[..., :3, :3].reshape(-1, 9) @ _OUTER_OF_ROTATION
+    outer[:, ::5] += 1.0
+    # Each row is the quaternion times one of its components; the largest is the stable one.
+    best = np.argmax(outer[:, ::5], axis=1)
+    quat = outer.reshape(-1, 4, 4)[np.arange(len(outer)), best]
+    quat /= np.linalg.norm(quat, axis=1, keepdims=True) * np.where(quat[:, 3:] < 0, -1.0, 1.0)
+    return np.asarray(quat.reshape(*shape, 4))
 
 
 def chained(T_a_b: Transform, T_b_c: Transform) -> Transform:
@@ -232,11 +231,3 @@ def skew(T_a_b: NDArray[np.float64]) -> NDArray[np.float64]:
 def orthonormal(T_a_b: Transform) -> Transform:
     """Return the transform (4, 4) with an exactly orthonormal rotation."""
     return from_quat_xyzw(T_a_b[..., :3, 3], to_quat_xyzw(T_a_b))
-
-
-def _left_jacobian(phi: NDArray[np.float64]) -> NDArray[np.float64]:
-    angle = np.maximum(np.linalg.norm(phi, axis=-1), _SMALLEST_RAD)[..., None, None]
-    k = hat(phi)
-    a = (1.0 - np.cos(angle)) / angle**2
-    b = (angle - np.sin(angle)) / angle**3
-    return np.asarray(np.eye(3) + a * k + b * k @ k)
