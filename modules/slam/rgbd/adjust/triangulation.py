@@ -47,6 +47,11 @@ class _Eye:
     def features(self) -> Features:
         return self.keyframe.features
 
+    @property
+    def levels(self) -> NDArray[np.int64]:
+        """Return the levels (N,) of the pyramid, ascending."""
+        return self.features.levels[self.rows]
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Found:
@@ -158,10 +163,17 @@ def _match(visual_map: VisualMap, new: _Eye, other: _Eye) -> Matches:
     lines = new.rays @ essential.T  # (N, 3), in the other's image at z = 1
     within = _LINE_SIGMAS * np.sqrt(2.0) * new.sigma_px / visual_map.camera.fx  # of about a level
     lines /= np.maximum(np.hypot(lines[:, 0], lines[:, 1]) * within, 1e-12)[:, None]
-    gaps = lines.astype(np.float32) @ other.rays.T.astype(np.float32)
-    rows, candidates = np.nonzero(np.abs(gaps, out=gaps) <= 1.0)
-    levels = new.features.levels[new.rows][rows] - other.features.levels[other.rows][candidates]
-    rows, candidates = (pairs[np.abs(levels) <= _LEVEL_TOLERANCE] for pairs in (rows, candidates))
+    levels, their_levels = new.levels, other.levels  # ascending: pairs of levels are blocks
+    lines, rays = lines.astype(np.float32), other.rays.T.astype(np.float32)
+    pairs = [(np.zeros(0, np.int64), np.zeros(0, np.int64))]
+    for level in np.unique(levels):
+        first, end = np.searchsorted(levels, [level, level + 1])
+        near = [level - _LEVEL_TOLERANCE, level + _LEVEL_TOLERANCE + 1]
+        low, high = np.searchsorted(their_levels, near)
+        is_on_line = np.abs(lines[first:end] @ rays[:, low:high]) <= 1.0
+        row, candidate = np.divmod(np.flatnonzero(is_on_line), max(high - low, 1))
+        pairs.append((row + first, candidate + low))
+    rows, candidates = (np.concatenate(each) for each in zip(*pairs, strict=True))
     descriptors = other.features.descriptors[other.rows]
     return match_pairs(
         rows, candidates, new.features.descriptors[new.rows], descriptors, ratio=_RATIO
@@ -170,14 +182,16 @@ def _match(visual_map: VisualMap, new: _Eye, other: _Eye) -> Matches:
 
 def _intersect(visual_map: VisualMap, new: _Eye, other: _Eye, matches: Matches) -> _Found:
     """Return the points that each best fit two pixels (midpoint, then Gauss-Newton)."""
-    pairs = ((new, matches.landmark_rows), (other, matches.feature_rows))
+    pairs = [
+        (eye, _sightings(visual_map, eye, rows))
+        for eye, rows in ((new, matches.landmark_rows), (other, matches.feature_rows))
+    ]
     points = _midpoints(new, other, matches)
     for _ in range(_STEPS):
         information, slopes = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
         agrees = np.ones(len(points), bool)
-        for eye, rows in pairs:
+        for eye, seen in pairs:
             points_cam = points @ eye.T_cam_local[:3, :3].T + eye.T_cam_local[:3, 3]
-            seen = _sightings(visual_map, eye, rows)
             found = errors(visual_map.camera, points_cam.T, seen)
             by_point = np.moveaxis(found.by_point, 2, 0) @ eye.T_cam_local[:3, :3]
             information += np.swapaxes(by_point, 1, 2) @ by_point

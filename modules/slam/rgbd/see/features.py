@@ -23,7 +23,7 @@ class Features:
     """The features of one image."""
 
     uv_px: NDArray[np.float64]  # (N, 2), without distortion
-    levels: NDArray[np.int64]  # (N,), of the pyramid
+    levels: NDArray[np.int64]  # (N,), of the pyramid, ascending
     descriptors: NDArray[np.uint8]  # (N, 32)
     depth_m: NDArray[np.float64]  # (N,), along the optical axis, 0 = missing
     depth_slope_m_per_px: NDArray[np.float64]  # (N,), slope of the depth there
