@@ -33,9 +33,8 @@ class PlaceIndex:
 
     def __init__(self) -> None:
         rng = np.random.default_rng(_SEED)
-        self._bits = np.stack(
-            [rng.permutation(_DESCRIPTOR_BITS)[:_WORD_BITS] for _ in range(_TABLES)]
-        )
+        chosen = [rng.permutation(_DESCRIPTOR_BITS)[:_WORD_BITS] for _ in range(_TABLES)]
+        self._bits = np.concatenate(chosen)
         self._places: dict[int, NDArray[np.int32]] = {}  # words, ascending
         self._holders = np.zeros(_WORDS, np.uint16)  # how many places have the word
 
@@ -69,8 +68,9 @@ class PlaceIndex:
 
     def _words(self, descriptors: NDArray[np.uint8]) -> NDArray[np.int32]:
         """Return the distinct words of descriptors (N, 32), ascending; each table has its own."""
-        bits = np.unpackbits(descriptors, axis=1)
-        powers = 1 << np.arange(_WORD_BITS, dtype=np.int32)
-        tables = [(bits[:, chosen] @ powers) for chosen in self._bits]
-        words = np.stack(tables, axis=1) + (np.arange(_TABLES) << _WORD_BITS)
-        return np.asarray(np.unique(words), dtype=np.int32)
+        bits = np.unpackbits(descriptors, axis=1).take(self._bits, axis=1)
+        values = np.packbits(bits, axis=1, bitorder="little").view("<u2")  # of _WORD_BITS bits
+        words = values.astype(np.int32) + (np.arange(_TABLES) << _WORD_BITS)
+        is_present = np.zeros(_WORDS, bool)
+        is_present[words] = True
+        return np.flatnonzero(is_present).astype(np.int32)
