@@ -21,12 +21,12 @@ _END_RATIO = 0.4  # of a cell: a point this far from the centre of its neighbour
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class NearestSurfaces:
-    """The nearest surface to each of N points."""
+    """The nearest surface to each of N points, component by component: axes of two are slow."""
 
-    points: NDArray[np.float64]  # (N, 2) [m], local
-    shape: NDArray[np.float64]  # (N, 3)
+    points: NDArray[np.float64]  # (2, N) [m], local
+    shape: NDArray[np.float64]  # (3, N)
     normal_variance: NDArray[np.float64]  # (N,) [rad^2]
-    outward: NDArray[np.float64]  # (N, 2), out of the map: unit vector at a surface's end, else 0
+    outward: NDArray[np.float64]  # (2, N), out of the map: unit vector at a surface's end, else 0
 
 
 class LikelihoodField:
@@ -43,16 +43,17 @@ class LikelihoodField:
         self._limit = np.array([columns - 1, rows - 1])
         flat = (cells[:, 1] - self._origin[1]) * columns + cells[:, 0] - self._origin[0]
         occupied, index = np.unique(flat, return_inverse=True)
-        self._average(surfaces, index, len(occupied))
+        averages = _averages(surfaces, index, len(occupied))
         image = np.full((rows, columns), 255, dtype=np.uint8)
         image.reshape(-1)[occupied] = 0
         distance_px, labels = cv2.distanceTransformWithLabels(
             image, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
         )
-        self._labels = labels
-        self._surface_of_label = np.zeros(len(occupied) + 1, dtype=np.int64)
-        self._surface_of_label[labels.reshape(-1)[occupied]] = np.arange(len(occupied))
-        self._outward = self._out_of_map(image, occupied)
+        surface_of_label = np.zeros(len(occupied) + 1, dtype=np.int64)
+        surface_of_label[labels.reshape(-1)[occupied]] = np.arange(len(occupied))
+        self._nearest = surface_of_label[labels]
+        outward = self._out_of_map(image, occupied, averages[:2].T, averages[2:5])
+        self._surfaces = np.concatenate([averages, outward.T])
         self._likelihood = np.maximum(
             np.float32(1.0) - distance_px * np.float32(resolution_m / _REACH_M), np.float32(0.0)
         )
@@ -65,33 +66,31 @@ class LikelihoodField:
 
     def refuted_ratio(self, points_local: NDArray[np.float64]) -> float:
         """Return the share of points (N, 2) [m] in free space, of those and those on surfaces."""
-        away_m = np.linalg.norm(points_local - self.nearest(points_local).points, axis=1)
+        away_m = np.linalg.norm(points_local - self.nearest(points_local.T).points.T, axis=1)
         same = int((away_m < _SAME_M).sum())
         free = int(self.is_free(points_local[away_m >= _SAME_M]).sum())
         return free / max(free + same, 1)
 
     def nearest(self, points_local: NDArray[np.float64]) -> NearestSurfaces:
-        """Return the nearest surfaces of points (N, 2) [m]."""
+        """Return the nearest surfaces of points (2, N) [m]."""
         column, row = self._cells(points_local)
-        surface = self._surface_of_label[self._labels[row, column]]
+        found = self._surfaces.take(self._nearest[row, column], axis=1)
         return NearestSurfaces(
-            points=self._points[surface],
-            shape=self._shape[surface],
-            normal_variance=self._normal_variance[surface],
-            outward=self._outward[surface],
+            points=found[:2], shape=found[2:5], normal_variance=found[5], outward=found[6:]
         )
 
     def likelihood(
         self, points_local: NDArray[np.float64], offsets_m: NDArray[np.float64]
     ) -> NDArray[np.float32]:
         """Return likelihoods (A, K), 0 to 1, of points (A, N, 2) [m] moved by offsets (K, 2)."""
-        columns = int(self._limit[0]) + 1
-        start = np.floor(points_local / self.resolution_m).astype(np.int64) - self._origin
         shift = np.round(offsets_m / self.resolution_m).astype(np.int64)
-        column = np.clip(start[:, None, :, 0] + shift[None, :, None, 0], 0, self._limit[0])
-        row = np.clip(start[:, None, :, 1] + shift[None, :, None, 1], 0, self._limit[1])
-        found = np.take(self._likelihood.reshape(-1), row * columns + column)
-        return np.asarray(found.mean(axis=-1))
+        reach = int(np.abs(shift).max(initial=0))
+        grid = np.pad(self._likelihood, 2 * reach)  # 0 as at the border: points may lie outside
+        start = np.floor(points_local / self.resolution_m).astype(np.int64) - self._origin
+        start = np.minimum(np.maximum(start, -reach), self._limit + reach) + 2 * reach
+        across = np.array([1, grid.shape[1]])
+        index = (start @ across)[:, None, :] + (shift @ across)[None, :, None]
+        return np.asarray(grid.take(index).mean(axis=-1))
 
     def pooled(self, factor: int) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
         """Return the best likelihood (rows, columns) per `factor`^2 cells, and its corner."""
@@ -107,39 +106,44 @@ class LikelihoodField:
     @property
     def points(self) -> NDArray[np.float64]:
         """Return the mean surface points (N, 2) [m] of all cells that have one."""
-        return self._points
-
-    def _average(self, surfaces: SurfacePoints, index: NDArray[np.int64], count: int) -> None:
-        weight = surfaces.weight
-        total = np.bincount(index, weights=weight, minlength=count)
-
-        def mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
-            return np.asarray(np.bincount(index, weights=weight * values, minlength=count) / total)
-
-        self._points = np.column_stack([mean(values) for values in surfaces.points.T])
-        self._shape = np.column_stack([mean(values) for values in surfaces.shape.T])
-        known = np.bincount(index, weights=1.0 / surfaces.normal_variance, minlength=count)
-        self._normal_variance = 1.0 / known
+        return self._surfaces[:2].T
 
     def _out_of_map(
-        self, image: NDArray[np.uint8], occupied: NDArray[np.int64]
+        self,
+        image: NDArray[np.uint8],
+        occupied: NDArray[np.int64],
+        points: NDArray[np.float64],
+        shape: NDArray[np.float64],
     ) -> NDArray[np.float64]:
         """Return per surface the direction (M, 2) in which the map ends, 0 for a line."""
-        is_post = self._shape[:, 0] + self._shape[:, 2] >= _POST
+        is_post = shape[0] + shape[2] >= _POST
         steps = np.arange(-_AROUND_CELLS, _AROUND_CELLS + 1)
         around = occupied[is_post, None] + (steps[:, None] * image.shape[1] + steps).reshape(-1)
         is_mapped = image.reshape(-1)[around] == 0
-        surface = self._surface_of_label[self._labels.reshape(-1)[around]]
-        total = np.where(is_mapped[..., None], self._points[surface], 0.0).sum(axis=1)
-        out = self._points[is_post] - total / is_mapped.sum(axis=1)[:, None]
+        surface = self._nearest.reshape(-1)[around]
+        total = np.where(is_mapped[..., None], points[surface], 0.0).sum(axis=1)
+        out = points[is_post] - total / is_mapped.sum(axis=1)[:, None]
         away_m = np.linalg.norm(out, axis=1, keepdims=True)
-        outward = np.zeros_like(self._points)
+        outward = np.zeros_like(points)
         outward[is_post] = out / np.maximum(away_m, _END_RATIO * self.resolution_m)
         return outward
 
-    def _cells(
-        self, points_local: NDArray[np.float64]
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        cells = np.floor(points_local / self.resolution_m).astype(np.int64) - self._origin
-        cells = np.minimum(np.maximum(cells, 0), self._limit)
-        return cells[:, 0], cells[:, 1]
+    def _cells(self, points_local: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Return the column and row (2, N) of points (2, N), or of the border next to them."""
+        cells = np.floor(points_local / self.resolution_m).astype(np.int64) - self._origin[:, None]
+        return np.asarray(np.minimum(np.maximum(cells, 0), self._limit[:, None]))
+
+
+def _averages(surfaces: SurfacePoints, index: NDArray[np.int64], count: int) -> NDArray[np.float64]:
+    """Return x, y, the shape, and the normal's variance (6, M) of surfaces per cell, as (N,) index.
+
+    Each is weighted.
+    """
+    weight = surfaces.weight
+    total = np.bincount(index, weights=weight, minlength=count)
+    means = [
+        np.bincount(index, weights=weight * values, minlength=count) / total
+        for values in (*surfaces.points.T, *surfaces.shape.T)
+    ]
+    known = np.bincount(index, weights=1.0 / surfaces.normal_variance, minlength=count)
+    return np.array([*means, 1.0 / known])

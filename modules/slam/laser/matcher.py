@@ -50,6 +50,7 @@ _SLACK = 2.0  # scans that fit worse by less do not add up
 _USUAL_SCANS = 20.0  # over which that average is taken
 _VIEW_M, _VIEW_RAD = 0.1, 0.1  # scans this far apart have independent errors
 _NOVELTY_MIN = 1e-3
+_EYE = np.eye(3)
 _NOISE_MIN = 0.1  # least noise of a scan, relative to the expected one: a map has cells
 
 
@@ -80,7 +81,8 @@ class Match:
         """Return the difference (3,) of the pose that a prior makes, by the scan's shape."""
         H, pose, weight = self.information, self.T_local_base, prior.weighed(self.T_local_base)
         pull = difference(self.T_local_alone, pose)
-        return np.asarray(np.linalg.inv(H + weight) @ (H @ pull - weight @ prior.off(pose)))
+        step = np.linalg.solve(H + weight, H @ pull - weight @ prior.off(pose))
+        return np.asarray(step, np.float64)
 
     def cost_with(self, prior: MotionPrior) -> float:
         """Return the cost with another prior, by the shape of the scan's cost here.
@@ -259,14 +261,18 @@ class Matcher:
 
         For each of the standard deviations of the scan's common error.
         """
-        arms, (ex, ey), (ax, ay) = pairs.arms, pairs.error.T, pairs.across.T
-        xx, xy, yy = pairs.shape.T
+        (x, y), (ex, ey), (ax, ay), (xx, xy, yy) = (
+            pairs.arms,
+            pairs.error,
+            pairs.across,
+            pairs.shape,
+        )
         robust = (kernel_m**2 / (kernel_m**2 + ax * ex + ay * ey)) ** 2
         gate = ~pairs.is_beyond & (ex * ex + ey * ey < (4.0 * kernel_m) ** 2)
         weight = scan_base.weight * pairs.certain * robust * gate / _CORRELATION
         total = float(weight.sum())
-        centre = (weight @ arms) / max(total, 1e-12)
-        lx, ly = -(arms[:, 1] - centre[1]), arms[:, 0] - centre[0]  # a point's motion per radian
+        centre = (pairs.arms @ weight) / max(total, 1e-12)
+        lx, ly = centre[1] - y, x - centre[0]  # a point's motion per radian
         tx, ty = xx * lx + xy * ly, xy * lx + yy * ly
         H = np.empty((3, 3))
         H[0, 0], H[0, 1], H[1, 1] = weight @ xx, weight @ xy, weight @ yy
@@ -277,13 +283,13 @@ class Matcher:
         spread_m = max(spread_m, 1e-3)
         H, g, weak = self._keep_held(H, g, total, spread_m)
         # From turning about the points' centre to turning about base.
-        M = np.eye(3)
+        M = _EYE.copy()
         M[:2, 2] = -centre[1], centre[0]
         found = []
         for shift_m in shifts_m:
             # (H^-1 + C)^-1 in constrained directions, for a common error C
-            C = shift_m**2 * np.diag([1.0, 1.0, spread_m**-2])
-            damping = np.linalg.inv(np.eye(3) + H @ C)
+            C = shift_m**2 * np.array([1.0, 1.0, spread_m**-2])
+            damping = np.linalg.inv(_EYE + H * C)
             found.append((M.T @ (damping @ H) @ M, M.T @ (damping @ g), weak))
         return found
 
@@ -294,12 +300,12 @@ class Matcher:
         if total <= 0:
             return np.zeros((3, 3)), np.zeros(3), 3
         scale = np.array([1.0, 1.0, 1.0 / spread_m])
-        values, vectors = np.linalg.eigh(H * np.outer(scale, scale) / total)
+        values, vectors = np.linalg.eigh(H * scale[:, None] * scale / total)
         held = values > self.degeneracy_ratio
         keep = vectors[:, held] @ vectors[:, held].T
         inverse = 1.0 / scale
         kept = keep @ (vectors * values) @ vectors.T @ keep
-        held_H: Matrix = total * np.outer(inverse, inverse) * kept
+        held_H: Matrix = total * inverse[:, None] * inverse * kept
         held_g: Planar = np.asarray(inverse * (keep @ (scale * g)), dtype=np.float64)
         return held_H, held_g, int(3 - held.sum())
 
@@ -312,12 +318,12 @@ def novelty(T_before_now: Planar) -> float:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Pairs:
-    """A scan's points, each with the nearest surface of the map."""
+    """A scan's points, each with the nearest surface of the map, component by component."""
 
-    arms: NDArray[np.float64]  # (N, 2) [m], from the base, axes of local
-    error: NDArray[np.float64]  # (N, 2) [m], from the surface
-    across: NDArray[np.float64]  # (N, 2) [m], of that, across the surface
-    shape: NDArray[np.float64]  # (N, 3)
+    arms: NDArray[np.float64]  # (2, N) [m], from the base, axes of local
+    error: NDArray[np.float64]  # (2, N) [m], from the surface
+    across: NDArray[np.float64]  # (2, N) [m], of that, across the surface
+    shape: NDArray[np.float64]  # (3, N)
     certain: NDArray[np.float64]  # (N,), share of the variance that is not the normal's
     is_beyond: NDArray[np.bool_]  # (N,), the surface has ended before
     is_sparse: NDArray[np.bool_]  # (N,), its direction is uncertain between the beams
@@ -325,14 +331,15 @@ class _Pairs:
     @classmethod
     def of(cls, scan_base: SurfacePoints, field: LikelihoodField, pose: Planar) -> _Pairs:
         """Return the pairs of a scan at a pose."""
-        arms = scan_base.points @ rotation(pose[2]).T
-        near = field.nearest(arms + pose[:2])
-        error = arms + pose[:2] - near.points
-        xx, xy, yy = near.shape.T
-        ex, ey = error.T
-        across = np.column_stack([xx * ex + xy * ey, xy * ex + yy * ey])
-        along = ((error - across) ** 2).sum(axis=1)  # a surface's end is farther away
-        beyond = near.outward[:, 0] * ex + near.outward[:, 1] * ey
+        arms = rotation(pose[2]) @ scan_base.points.T
+        points = arms + pose[:2, None]
+        near = field.nearest(points)
+        error, (xx, xy, yy) = points - near.points, near.shape
+        ex, ey = error
+        across = np.array([xx * ex + xy * ey, xy * ex + yy * ey])
+        rest = error - across
+        along = rest[0] ** 2 + rest[1] ** 2  # a surface's end is farther away
+        beyond = near.outward[0] * ex + near.outward[1] * ey
         is_dense = scan_base.spacing_m < field.resolution_m  # else cells between beams are empty
         # A surface's noise is that of the scan: both are expected, or both are estimated.
         turn = near.normal_variance * scan_base.weight * scan_base.noise_ratio**2  # [1/m^2]
@@ -358,14 +365,14 @@ def _residuals(
     that nothing saw before, is as likely as one at its surface, by the `noise` relative to the
     expected one.
     """
-    across = np.sqrt(np.maximum((pairs.across * pairs.error).sum(axis=1), 0.0))
-    far = np.linalg.norm(pairs.error, axis=1)
-    unknown = pairs.shape[:, 0] + pairs.shape[:, 2] == 0
+    across = np.sqrt(np.maximum((pairs.across * pairs.error).sum(axis=0), 0.0))
+    far = np.hypot(*pairs.error)
+    unknown = pairs.shape[0] + pairs.shape[2] == 0
     is_near = far < 4 * _INLIER_M
     is_alone = ~is_near & (far >= 2.0 * scan_base.spacing_m) | pairs.is_beyond
     evident = np.where(unknown, 0.0, across * np.sqrt(pairs.certain))
     alone = np.flatnonzero(is_alone & ~unknown)
-    is_free = field.is_free((pairs.arms + pose[:2])[alone])
+    is_free = field.is_free(pairs.arms[:, alone].T + pose[:2])
     evident[alone] = np.where(is_free, far[alone], noise / np.sqrt(scan_base.weight[alone]))
     return np.where(is_near & ~unknown & ~pairs.is_sparse, across, far), far, evident
 

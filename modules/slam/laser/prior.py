@@ -50,7 +50,7 @@ class MotionPrior:
         squared = self._squared(pose)
         weight = [min((self.freedom + n) / (self.freedom + squared[n]), 1.0) for n in (2, 1)]
         root = np.sqrt([weight[0], weight[0], weight[1]])
-        return np.asarray(self.information * np.outer(root, root))
+        return self.information * root[:, None] * root
 
     def cost_at(self, pose: Planar) -> float:
         """Return the negative logarithm of the prior at a pose, relative to its peak."""

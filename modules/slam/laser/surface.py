@@ -22,7 +22,10 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SurfacePoints:
-    """Points with their shape matrix: n n' for a wall with normal n, I for a post."""
+    """Points with their shape matrix: n n' for a wall with normal n, I for a post.
+
+    Their components lie one after the other in memory, as axes of two and three are slow.
+    """
 
     points: Array  # (N, 2) [m], frame as in the owner's name
     shape: Array  # (N, 3): xx, xy, yy; 0 with too few neighbours
@@ -43,14 +46,14 @@ class SurfacePoints:
         R = rotation(T_a_b[2])
         c, s = R[0, 0], R[1, 0]
         xx, xy, yy = self.shape.T
-        shape = np.column_stack(
+        shape = np.array(
             [
                 c * c * xx - 2 * c * s * xy + s * s * yy,
                 c * s * (xx - yy) + (c * c - s * s) * xy,
                 s * s * xx + 2 * c * s * xy + c * c * yy,
             ]
-        )
-        return replace(self, points=self.points @ R.T + T_a_b[:2], shape=shape)
+        ).T
+        return replace(self, points=(R @ self.points.T).T + T_a_b[:2], shape=shape)
 
 
 def joined(parts: Sequence[SurfacePoints]) -> SurfacePoints:
@@ -83,8 +86,8 @@ class ScanSurfaceReader:
         limit = min(self.range_max_m, scan.range_max_m)
         beam = np.flatnonzero(np.isfinite(ranges) & (ranges > scan.range_min_m) & (ranges <= limit))
         r, angle = ranges[beam], scan.angles_rad[beam].astype(np.float64)
-        points_laser = np.column_stack([r * np.cos(angle), r * np.sin(angle)])
-        points_base = points_laser @ self.T_base_laser[:2, :2].T + self.T_base_laser[:2, 3]
+        points_laser = np.array([r * np.cos(angle), r * np.sin(angle)])
+        points_base = (self.T_base_laser[:2, :2] @ points_laser + self.T_base_laser[:2, 3:]).T
         spacing = np.maximum(r * abs(scan.angle_step_rad), 1e-4)
         weight = 1.0 / (self.noise_m + self.noise_per_m * r * r) ** 2
         shape, spread_m2 = _shape(points_base, spacing)
@@ -134,4 +137,4 @@ def _shape_of_spread(xx: Array, xy: Array, yy: Array) -> Array:
     blob = np.clip((least / np.maximum(largest, 1e-12) - low) / (high - low), 0.0, 1.0)
     angle = 0.5 * np.arctan2(2 * xy, xx - yy)  # along the surface
     c, s = np.cos(angle), np.sin(angle)
-    return np.column_stack([s * s + blob * c * c, (blob - 1.0) * s * c, c * c + blob * s * s])
+    return np.array([s * s + blob * c * c, (blob - 1.0) * s * c, c * c + blob * s * s]).T
