@@ -38,16 +38,18 @@ class DetectionExperiment:
         (outcome,) = run_trials([Trial(name="detection")])
         keep_figure(outcome, "grey_mean", folder / "grey_mean.png")
         rows = self._rows(outcome)
-        draw_images(folder / "images.png", outcome.folder, list(self._shown_ns(outcome)))
+        pictures = {"grey_mean.png": "The mean of grey, the threshold, and confirmed changes."}
+        shown_ns = list(self._shown_ns(outcome))
+        if shown_ns:
+            caption = "The camera's image before and after each change, and where it was."
+            pictures["images.png"] = caption
+            draw_images(folder / "images.png", outcome.folder, shown_ns)
         columns = ("confirmed", "first image [s]", "confirmed at [s]", "after the true change [s]")
         grey = (f"grey {self._window_s:g} s before", "grey when confirmed")
         return Verdict(
             figures=list(self._figures(outcome)),
             table=Table(columns=(*columns, *grey, "the paper's second"), rows=rows),
-            pictures={
-                "grey_mean.png": "The mean of grey, the threshold, and confirmed changes.",
-                "images.png": "The camera's image before and after each change, and where it was.",
-            },
+            pictures=pictures,
         )
 
     def _figures(self, outcome: TrialResult) -> Iterator[Figure]:
