@@ -57,6 +57,8 @@ def test_relations_that_no_pose_matches_are_refused(tmp_path):
     relations = relations_of(["50 60 0 0 0 0 0 0"], tmp_path / "x.relations")
     with pytest.raises(InputError, match="none of the 1 relations"):
         relation_errors(four_poses(), relations)
+    with pytest.raises(InputError, match="the trajectory is empty"):
+        relation_errors(Trajectory.empty(), relations)
 
 
 def test_laser_log_of_intel_matches_all_its_relations(shared_data):

@@ -1,10 +1,13 @@
 """The experiment `liars`: who drives what with which wheels, and what is promised of it."""
 
+import json
+import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from sceneslam.evaluation.verdict import write_verdict
 from sceneslam.experiments.liars.experiment import LiarsExperiment
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.experiment import TrialResult
@@ -49,6 +52,8 @@ def found(errors_m, **settings):
 
 
 def straight(error_m):
+    if math.isnan(error_m):
+        return Trajectory.empty()
     T_world_base = np.stack([np.eye(4), np.eye(4)])
     T_world_base[1, 0, 3] = 1.0 + error_m
     return Trajectory(stamps_ns=np.array([10**9, 2 * 10**9]), T_world_base=T_world_base)
@@ -80,6 +85,21 @@ def test_laser_is_held_to_its_error_with_honest_wheels(tmp_path):
     assert "source.path=some.clf" in trials[0].overrides
     assert trials[1].values == {"effects": {"lie": "reversed"}}
     assert verdict.table.rows[1] == ["reversed", "0.0310 (100.0%)"]
+
+
+@pytest.mark.parametrize("poses", ["none", "others"])
+def test_laser_without_a_pose_breaks_its_promise(tmp_path, poses):
+    relations = tmp_path / "some.relations"
+    relations.write_text(RELATION if poses == "none" else "50 60 0 0 0 0 0 0\n")
+    error_m = math.nan if poses == "none" else 0.0
+    given = {"intel/laser/none": error_m, "intel/laser/reversed": error_m}
+    logs = {"intel": {"log": "some.clf", "relations": str(relations)}}
+    lies = {"reversed": {"lie": "reversed"}}
+    verdict, _ = found(given, logs=logs, stories=[], lies=lies)
+    assert not verdict.holds and verdict.table.rows[1] == ["reversed", "-"]
+    write_verdict(tmp_path, "liars", verdict)
+    (figure,) = json.loads((tmp_path / "verdict.json").read_text())["figures"]
+    assert figure["value"] is None and not figure["holds"]
 
 
 def test_nothing_to_drive_is_named():

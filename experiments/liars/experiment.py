@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from sceneslam.evaluation.relations import Relations, relation_errors
+from sceneslam.types.errors import InputError
 from sceneslam.types.experiment import Figure, RunTrials, Table, Trial, TrialResult, Verdict
 from sceneslam.types.ranges import check_above, check_least, check_some
 
@@ -30,10 +31,16 @@ class Drive:
     relations: Path | None = None  # true relative poses of a log
 
     def error_m(self, outcome: TrialResult) -> float:
-        """Return the mean error of the relations, else the ATE; NaN where neither is known."""
+        """Return the mean error of the relations, else the ATE; NaN where neither is known.
+
+        NaN breaks the promise. Raises InputError if the relations cannot be read.
+        """
         if self.relations is not None:
-            errors = relation_errors(outcome.trajectory, Relations.read(self.relations))
-            return errors["trans_mean_m"]
+            relations = Relations.read(self.relations)
+            try:
+                return relation_errors(outcome.trajectory, relations)["trans_mean_m"]
+            except InputError:  # no pose at their instants
+                return math.nan
         ate_m = outcome.metrics["ate_rmse_m"]
         return math.nan if ate_m is None else float(ate_m)
 

@@ -50,7 +50,7 @@ class Relations:
 def relation_errors(trajectory: Trajectory, relations: Relations) -> dict[str, float | int]:
     """Return mean and standard deviation of the motions' errors, and of their squares.
 
-    Raises InputError when no relation is matched.
+    Raises InputError when no relation is matched, as by an empty trajectory.
     """
     trans_m, rot_deg = motion_errors(trajectory, relations).T
     total = len(relations.first_ns)
@@ -78,8 +78,11 @@ def motion_errors(trajectory: Trajectory, relations: Relations) -> NDArray[np.fl
     """Return the errors (N, 2) [m, deg] of the N relations that are matched.
 
     A relation is matched when the trajectory has a pose within 0.5 ms of both its instants. The
-    translation error is the length, the rotation error the angle of inv(true) @ estimated.
+    translation error is the length, the rotation error the angle of inv(true) @ estimated. Raises
+    InputError for an empty trajectory.
     """
+    if not len(trajectory):
+        raise InputError("the trajectory is empty, no relation can be measured on it")
     first, second, off_ns = _ends(trajectory, relations)
     kept = np.flatnonzero(off_ns <= _SAME_STAMP_S * 1e9)
     T_world_base = trajectory.T_world_base

@@ -60,7 +60,7 @@ def _plain(figure: Figure) -> dict[str, str | float | bool | None]:
         "unit": figure.unit,
         "relation": figure.relation.value,
         **low,
-        "bound": figure.bound,
+        "bound": figure.bound if math.isfinite(figure.bound) else None,
         "holds": figure.holds,
     }
 
