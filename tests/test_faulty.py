@@ -153,6 +153,15 @@ def test_a_dropout_silences_one_sensor_for_a_while(record):
     assert all(one.image_bgr is not None for one in seen[:first])
 
 
+def test_a_second_run_in_the_same_folder_has_the_same_faults(record):
+    stamps_ns, lines = [], []
+    for _ in range(2):
+        stamps_ns.append([one.stamp_ns for one in source(record, "clock", "duplicate")])
+        lines.append([(line["stamp_ns"], line["kind"]) for line in struck(record)])
+    assert lines[0] and lines[0] == lines[1]
+    assert stamps_ns[0] == stamps_ns[1]
+
+
 @pytest.mark.parametrize(
     ("changes", "key"),
     [

@@ -36,6 +36,11 @@ class FaultPlan:
         lines = self.record.read_text().splitlines() if self.record.exists() else []
         self._struck = {json.loads(line)["stamp_ns"] for line in lines}
 
+    def begin_anew(self) -> None:
+        """Forget what has struck, for a run whose source is read from its beginning."""
+        self.record.unlink(missing_ok=True)
+        self._struck.clear()
+
     def strike(self, stamp_ns: int) -> str | None:
         """Return the fault that strikes at a stamp, None where none does; note it."""
         rng = np.random.default_rng([self.seed, stamp_ns % 2**64])

@@ -51,6 +51,7 @@ class FaultySource(Wrapped):
 
     def __iter__(self) -> Iterator[Observation]:
         """Yield the source's observations with the injected faults."""
+        self._plan.begin_anew()
         late: Observation | None = None
         silent: dict[str, int] = {}  # sensor -> end of its silence [ns]
         self._T_new_odom: Transform | None = None  # new odometry frame after a reset
