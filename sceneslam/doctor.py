@@ -10,7 +10,7 @@ from importlib.resources import files
 from typing import Any
 
 from sceneslam.config.build import opened_source
-from sceneslam.config.check import TOP_LEVEL
+from sceneslam.config.check import TOP_LEVEL, check_given
 from sceneslam.config.component import ComponentBuilder
 from sceneslam.config.words import is_override
 from sceneslam.interfaces import Live, SlamModule
@@ -44,6 +44,8 @@ def examine(words: Sequence[str]) -> list[str]:
         raise ConfigError("doctor", " ".join(words) or "nothing", "source=NAME, as source=ros2")
     words = [word for word in words if _key_of(word) in ("source", "effects")]
     config: dict[str, Any] = composed(tuple(words), None)
+    for key in ("source", "effects"):
+        check_given(config.get(key), key)
     with opened_source(config, ComponentBuilder(config)) as source:
         is_live = isinstance(source, Live) and source.live is not None
         rig = source.rig

@@ -86,6 +86,18 @@ def test_a_misspelt_word_is_refused_with_the_nearest_known_one(tmp_path, word, s
         examine(("source=rosbag", f"source.path={tmp_path}", word))
 
 
+@pytest.mark.parametrize(
+    ("words", "key"),
+    [
+        (("source=rosbag",), "source.path"),
+        (("source=two_rooms", "effects=exposure_times"), "effects.path"),
+    ],
+)
+def test_value_that_is_not_given_is_named_as_by_a_run(words, key):
+    with pytest.raises(ConfigError, match=f"{key}: got nothing, allowed: a value, as in {key}="):
+        examine(words)
+
+
 def test_nobody_there_is_an_input_error(monkeypatch):
     monkeypatch.setattr(ros2, "open_transport", lambda network: Robot())
     with pytest.raises(InputError, match="nobody publishes a sensor there"):
