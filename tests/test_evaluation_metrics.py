@@ -62,6 +62,7 @@ KEYS = {
 }
 SWITCH_KEYS = {
     "stamp_ns",
+    "decided_ns",
     "scene",
     "from",
     "to",

@@ -111,6 +111,21 @@ def test_light_that_is_back_before_the_switch_makes_it_false():
     assert metrics["switches"][0]["confirm_delay_s"] is None
 
 
+def test_light_that_is_back_before_a_slow_module_has_started_makes_no_switch_false():
+    truth, run = true_loop(), switched_run()
+    decided_ns = int(stamps(200)[90])
+    events = [
+        {**event, "decided_ns": decided_ns} if event["event"] == "decision" else event
+        for event in run.events
+    ]
+    back = SceneChange(stamp_ns=int(stamps(200)[95]), scene="Bright")
+    truth = GroundTruth(trajectory=truth.trajectory, scenes=(*truth.scenes, back))
+    metrics = evaluate(replace(run, events=events), truth, settings=SETTINGS)
+    (switch,) = metrics["switches"]
+    assert metrics["false_switches"] == 0
+    assert switch["stamp_ns"] - switch["confirm_delay_s"] * 1e9 == truth.scenes[1].stamp_ns
+
+
 def test_switch_for_a_lost_module_is_never_false_and_has_no_delay():
     run = switched_run()
     events = [{**e, "reason": "lost"} if e["event"] == "decision" else e for e in run.events]

@@ -32,8 +32,9 @@ def list_switches(
 
     `jump_m` and `jump_rad` are the error of the estimated motion across the seam against the true
     motion, or else the jump that the hand-over measured. None is unknown: a module without a pose
-    before it was replaced has neither jump nor gap. `confirm_delay_s` is the time since the true
-    change that a switch is the first to answer. `scenes` maps own scenes to the truth's names.
+    before it was replaced has neither jump nor gap. `confirm_delay_s` is the time from the true
+    change that a switch is the first to answer until the new module takes over. `scenes` maps own
+    scenes to the truth's names.
     """
     decisions = [event for event in result.events if is_switch(event)]
     return [_describe(decision, result, truth, scenes) for decision in decisions]
@@ -57,7 +58,7 @@ def count_false(
     false = [
         s
         for s in by_scene
-        if true_scene(truth, s["stamp_ns"]) != scenes.get(s["scene"], s["scene"])
+        if true_scene(truth, _decided_ns(s)) != scenes.get(s["scene"], s["scene"])
     ]
     return len(false)
 
@@ -125,6 +126,7 @@ def _describe(
     jump_m, jump_rad = _jump(result, truth, seam, handover) if seam else (None, None)
     return {
         "stamp_ns": int(decision["stamp_ns"]),
+        "decided_ns": _decided_ns(decision),
         "scene": decision["scene"],
         "from": decision["from"],
         "to": decision["to"],
@@ -159,7 +161,7 @@ def _confirm_delay_s(
     Only the first decision for the new scene answers a change: a later one is for another own name
     of the same scene, or takes a wrong scene back.
     """
-    change = _change_in_force(truth, decision["stamp_ns"]) if truth else None
+    change = _change_in_force(truth, _decided_ns(decision)) if truth else None
     if truth is None or change is None or change is truth.scenes[0]:
         return None
     answers = (
@@ -167,12 +169,17 @@ def _confirm_delay_s(
         for event in events
         if event["event"] == "decision"
         and event["reason"] == "scene"
-        and event["stamp_ns"] >= change.stamp_ns
+        and _decided_ns(event) >= change.stamp_ns
         and scenes.get(event["scene"], event["scene"]) == change.scene
     )
     if next(answers, None) is not decision:
         return None
     return float(decision["stamp_ns"] - change.stamp_ns) * 1e-9
+
+
+def _decided_ns(decision: Mapping[str, Any]) -> int:
+    """Return when a switch was decided; the new module takes over once it has started."""
+    return int(decision.get("decided_ns", decision["stamp_ns"]))
 
 
 def true_changes(truth: GroundTruth) -> list[SceneChange]:
