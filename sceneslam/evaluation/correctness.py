@@ -57,12 +57,12 @@ def correct_rate_observed(
     """Return the share of the time of a run with a correct pose, in [0, 1].
 
     As `correct_rate`, but only time between successive observations (N,) that the ground truth both
-    covers counts: time without observations or ground truth is left out, and a run that is correct
-    at each observation gets 1. NaN when there is no such time.
+    covers counts, at most 1 s of each: time without observations or ground truth is left out, and a
+    run that is correct at each observation gets 1. NaN when there is no such time.
     """
     known = covered(truth, observed_ns, TRUTH_GAP_S)
     begins = known[:-1][np.diff(known) == 1]
-    lasts_ns = observed_ns[begins + 1] - observed_ns[begins]
+    lasts_ns = np.minimum(observed_ns[begins + 1] - observed_ns[begins], _POSE_GAP_NS)
     if not lasts_ns.sum():
         return float("nan")
     judged = _judge(estimate, truth, limits)
