@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.evaluation.association import interpolated
-from sceneslam.evaluation.path import segment_ends
+from sceneslam.evaluation.path import distances_m, segment_ends
 from sceneslam.types import se3
 from sceneslam.types.trajectory import Trajectory
 
@@ -32,7 +32,7 @@ def best_of(
     stamps_ns = _stamps_ns(truth)
     true = interpolated(truth, stamps_ns).T_world_base
     known = [_poses(estimate, stamps_ns) for estimate in estimates]
-    ends = segment_ends(true, segment_m)
+    ends = segment_ends(distances_m(true[:, :3, 3]), segment_m)
     poses = se3.identity()[None, None]  # (choices, poses so far, 4, 4)
     cost_m2 = np.zeros(1)  # of all segments that have ended
     for piece in _pieces(len(stamps_ns), piece_s):
