@@ -17,7 +17,7 @@ from sceneslam.evaluation.accuracy import (
 from sceneslam.evaluation.alignment import align
 from sceneslam.evaluation.association import associate, covered, interpolated, nearest
 from sceneslam.evaluation.comparison import compare
-from sceneslam.evaluation.correctness import CorrectLimits, correct_rate
+from sceneslam.evaluation.correctness import CorrectLimits, correct_rate, correct_rate_observed
 from sceneslam.evaluation.files import read_poses
 from sceneslam.evaluation.path import length_ratio, segment_errors
 from sceneslam.types import se3
@@ -171,6 +171,18 @@ def test_segment_error_is_the_motions_error_over_each_stretch_of_the_true_path()
     np.testing.assert_allclose(aside.trans_m, found.trans_m, atol=1e-9)
 
 
+def test_segments_do_not_span_a_way_without_poses():
+    x_m = 40.0 - np.abs(np.arange(801) * 0.1 - 40.0)  # 40 m out, and back
+    truth = straight(np.diff(x_m))
+    drifted = straight(1.01 * np.diff(x_m))
+    seen = np.flatnonzero(np.abs(np.arange(801) - 400) > 150)  # not around the turn
+    estimate = Trajectory(
+        stamps_ns=drifted.stamps_ns[seen], T_world_base=drifted.T_world_base[seen]
+    )
+    found = segment_errors(estimate, truth, 0.01, 9.95).trans_m
+    assert len(found) == 2 * 150 and found == pytest.approx(0.1, abs=0.01)
+
+
 def test_length_ratio_tells_a_scale_and_ignores_what_was_not_estimated():
     truth, twice = loop(100), loop(100)
     twice.T_world_base[:, :3, 3] *= 1.05
@@ -200,6 +212,17 @@ def test_correct_rate_lets_a_pose_vouch_for_one_second():
     assert correct_rate(
         estimate, truth, CorrectLimits(limit_m=0.1, limit_rad=0.1)
     ) == pytest.approx(0.15)
+
+
+def test_correct_rate_does_not_count_a_pause_of_the_recording():
+    truth = loop(101)
+    observed = np.r_[0:21, 81:101]  # 6 s without observations
+    wrong = truth.T_world_base.copy()
+    wrong[20] = wrong[20] @ se3.from_xy_yaw(9.0, 0.0, 0.0)
+    estimate = Trajectory(stamps_ns=truth.stamps_ns[observed], T_world_base=wrong[observed])
+    limits = CorrectLimits(limit_m=3.0, limit_rad=np.pi)
+    rate = correct_rate_observed(estimate, truth, truth.stamps_ns[observed], limits)
+    assert rate == pytest.approx(3.9 / 4.9)
 
 
 def test_correct_rate_of_no_poses_is_zero_and_without_truth_unknown():
@@ -263,6 +286,19 @@ def test_comparison_aligns_nothing():
     assert difference.max_m == pytest.approx(0.5)
     assert difference.rms_m == pytest.approx(0.5)
     assert np.isnan(compare(reference, loop(50, START_NS + 10**12), 0.01).max_m)
+
+
+def test_a_map_that_begins_later_is_laid_on_the_other():
+    whole = loop(50)
+    T_map_begin = whole.T_world_base[20]
+    later = Trajectory(
+        stamps_ns=whole.stamps_ns[20:],
+        T_world_base=se3.inverse(T_map_begin) @ whole.T_world_base[20:],
+    )
+    assert compare(later, whole, 0.01).max_m == pytest.approx(0.0, abs=1e-9)
+    assert compare(whole, later, 0.01).max_m == pytest.approx(0.0, abs=1e-9)
+    in_a_loaded_map = moved(later, T_map_begin @ se3.from_xy_yaw(0.3, 0.0, 0.0))
+    assert compare(in_a_loaded_map, whole, 0.01).max_m == pytest.approx(0.3)
 
 
 @pytest.mark.parametrize(

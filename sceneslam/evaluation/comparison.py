@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from sceneslam.evaluation.accuracy import root_mean_square
 from sceneslam.evaluation.association import associate
+from sceneslam.types import se3
 from sceneslam.types.trajectory import Trajectory
 
 
@@ -31,13 +32,27 @@ class Difference:
 
 
 def compare(trajectory: Trajectory, reference: Trajectory, max_gap_s: float) -> Difference:
-    """Return the distance of poses within `max_gap_s` of each other, directly in `map`.
+    """Return the distance of poses within `max_gap_s` of each other, in `map`.
 
-    There is no alignment: both runs start at the identity at the same place.
+    Two runs that begin together begin at the same pose, and are not aligned. A map that begins
+    later, at the identity, is laid on the other at the first pose that both have.
     """
     matches = associate(trajectory, reference, max_gap_s)
-    offset_m = trajectory.positions_m[matches.first] - reference.positions_m[matches.second]
+    T_first = trajectory.T_world_base[matches.first]
+    T_second = reference.T_world_base[matches.second]
+    if _begins_within(matches.first, T_first, matches.second) or _begins_within(
+        matches.second, T_second, matches.first
+    ):
+        T_second = T_first[0] @ se3.inverse(T_second[0]) @ T_second
     return Difference(
         stamps_ns=trajectory.stamps_ns[matches.first],
-        differences_m=np.linalg.norm(offset_m, axis=1),
+        differences_m=np.linalg.norm(T_first[:, :3, 3] - T_second[:, :3, 3], axis=1),
     )
+
+
+def _begins_within(
+    matched: NDArray[np.int64], T_map_base: NDArray[np.float64], others: NDArray[np.int64]
+) -> bool:
+    """Tell whether a map begins, at the identity, while the other trajectory is under way."""
+    is_later = len(matched) > 0 and matched[0] == 0 and others[0] > 0
+    return is_later and np.allclose(T_map_base[0], np.eye(4), atol=1e-6)
