@@ -20,7 +20,7 @@ from sceneslam.atlas.save import save_map
 from sceneslam.bus.bus import Bus
 from sceneslam.config.build import RunParts
 from sceneslam.config.settings import LIVE
-from sceneslam.engine.live import LiveTally, Spent, run_live
+from sceneslam.engine.live import LiveTally, Spent, StepInterrupt, run_live
 from sceneslam.engine.open_sinks import OpenSinks
 from sceneslam.engine.slowest import Stopwatch
 from sceneslam.engine.steering import Operator
@@ -53,7 +53,7 @@ class RunLoop:
         self._say = say  # prints messages before the run
         self._warnings: tuple[str, ...] = ()
         self._tally = Tally(parts.rig.sensors)
-        self.is_interrupted = False
+        self.is_interrupted = self._is_stepping = False
         self.truth: GroundTruth | None = None
         self._result: RunResult | None = None
         self._parts, self._title, self.faults = parts, results.title, results.faults
@@ -105,6 +105,8 @@ class RunLoop:
         try:
             self._survey()
             self._feed()
+        except StepInterrupt:
+            self.is_interrupted = self._is_stepping = True
         except KeyboardInterrupt:
             self.is_interrupted = True
             self.faults.append(f"stopped after {len(self._observed_ns)} observations; saved so far")
@@ -116,7 +118,12 @@ class RunLoop:
         self._wall_s = perf_counter() - self._began_s
 
     def finish(self) -> None:
-        """Shut down everything but the sinks, in reverse order, and collect errors."""
+        """Shut down everything but the sinks, in reverse order, and collect errors.
+
+        Raises KeyboardInterrupt if a step still runs, since nothing can be saved beside it.
+        """
+        if self._is_stepping:
+            raise KeyboardInterrupt
         if self._bus.state == "terminate":
             self.faults.append(self._why_over())
         self._operator.close(self._last_ns())

@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import pytest
@@ -99,6 +100,35 @@ def test_ctrl_c_that_ends_what_hangs_at_the_end_of_a_run_costs_no_result(tmp_pat
     finished = run(config(run__report=False), tmp_path)
     assert finished.is_interrupted
     assert len(Trajectory.read_tum(tmp_path / "trajectory.tum")) == 1
+
+
+@pytest.mark.parametrize("times", [1, 2, 3])
+def test_live_run_saves_nothing_beside_the_step_that_ctrl_c_interrupted(
+    tmp_path, monkeypatch, times
+):
+    keep, finish, is_left, order = Keeping.keep, Atlas.finish, threading.Event(), []
+
+    def slow(self, stamp_ns):
+        for _ in range(times):
+            signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
+            is_left.wait(0.3)
+        keep(self, stamp_ns)
+        order.append("stepped")
+
+    def finished(self):
+        order.append("saves")
+        return finish(self)
+
+    monkeypatch.setattr(Keeping, "keep", slow)
+    monkeypatch.setattr(Atlas, "finish", finished)
+    settings = config(run__report=False, run__mode="live", run__rate=0.1)
+    if times < 3:
+        assert run(settings, tmp_path).is_interrupted
+        assert order == ["stepped", "saves"]
+        return
+    with pytest.raises(KeyboardInterrupt, match=r"python -m sceneslam\.recover"):
+        run(settings, tmp_path)
+    assert "saves" not in order and not (tmp_path / "trajectory.tum").exists()
 
 
 def test_ctrl_c_after_the_last_observation_costs_no_result(tmp_path, pressing):

@@ -1,12 +1,13 @@
 """Live mode: paced, the newest of every sensor first, every loss counted, silence named."""
 
+import signal
 import threading
 from time import monotonic
 
 import numpy as np
 import pytest
 
-from sceneslam.engine.live import LiveSettings, LiveTally, Spent, run_live
+from sceneslam.engine.live import LiveSettings, LiveTally, Spent, StepInterrupt, run_live
 from sceneslam.engine.mailbox import Mailbox, Waited
 from sceneslam.sources.contract.rising_live import RisingLive
 from sceneslam.types.errors import ConfigError
@@ -149,6 +150,37 @@ def test_interrupted_run_still_knows_what_it_cost():
     with pytest.raises(KeyboardInterrupt):
         run_live(observations(9, 10**6), step, print, settings=AT_ONCE, tally=tally)
     assert 0 < len(tally.latencies_ms) + tally.dropped < 9
+
+
+def interrupt():
+    signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
+
+
+def test_ctrl_c_is_raised_after_the_step_that_runs():
+    ended = threading.Event()
+
+    def step(observation):
+        interrupt()
+        threading.Event().wait(0.5)  # longer than the main thread looks for Ctrl-C
+        ended.set()
+        return True
+
+    with pytest.raises(KeyboardInterrupt) as raised:
+        run_live(observations(9, 10**6), step, print, settings=AT_ONCE)
+    assert ended.is_set() and raised.type is KeyboardInterrupt
+
+
+def test_ctrl_c_while_the_last_step_is_waited_for_is_told_apart():
+    is_raised = threading.Event()
+
+    def step(observation):
+        while not is_raised.wait(0.05):
+            interrupt()
+        return True
+
+    with pytest.raises(StepInterrupt):
+        run_live(observations(9, 10**6), step, print, settings=AT_ONCE)
+    is_raised.set()
 
 
 def test_step_can_end_the_run_while_the_source_is_silent():

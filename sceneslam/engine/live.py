@@ -58,6 +58,10 @@ class Spent:
     beside: Sequence[str] = ()
 
 
+class StepInterrupt(KeyboardInterrupt):
+    """The end of a run that was not waited for: a step still runs beside what follows."""
+
+
 def run_live(
     observations: Iterator[Observation],
     step: Callable[[Observation], bool],
@@ -76,7 +80,8 @@ def run_live(
     Without a `feed` they are those of a recording, and paced by their stamps. `note` receives
     events of the input: `silent`, `returned`, `behind` (a recording is read too slowly and its
     playback delayed), and the feed's. Both functions run in the thread `bus`, the source in another
-    one. Their exceptions are raised here; Ctrl-C ends both.
+    one. Their exceptions are raised here; Ctrl-C ends both, after the current step. Ctrl-C during
+    that step raises StepInterrupt.
     """
     run = _LiveRun(observations, step, note, settings=settings, feed=feed, spent=spent)
     run.tally = tally if tally is not None else run.tally
@@ -98,6 +103,7 @@ class _LiveRun:
         self._observations, self._step, self._note = observations, step, note
         self._settings, self._feed = settings, feed
         self._mailbox, self._is_over = Mailbox(), threading.Event()
+        self._has_stepped = threading.Event()  # set after the last step
         self.tally, self._errors = LiveTally(), list[BaseException]()
         self._lag_ns: int | None = None  # clock - stamp / rate, of the first observation
         self._last_ns = 0
@@ -108,24 +114,39 @@ class _LiveRun:
     def carry_out(self) -> LiveTally:
         source = threading.Thread(target=self._guard, args=(self._read,), name="source")
         source.daemon = True  # a driver that hangs does not keep the program running
-        bus = threading.Thread(target=self._guard, args=(self._work,), name="bus")
-        source.start()
-        bus.start()
+        bus = threading.Thread(target=self._step_all, name="bus")
         try:
-            while bus.is_alive():
-                bus.join(_LOOK_S)
+            bus.start()
+            source.start()  # no step before the bus is there to be waited for
+            # Not Thread.join: interrupted, it takes the thread for ended (CPython 3.11).
+            while not self._has_stepped.wait(_LOOK_S):
+                continue
         finally:
             self._is_over.set()
             self._mailbox.close(is_emptied=True)
-            bus.join()
+            if bus.ident is not None:
+                self._await_last_step()
             if self._feed is not None:
                 self._feed.close()
-            source.join(_LEAVE_S)
+            if source.ident is not None:
+                source.join(_LEAVE_S)
             self.tally.dropped = self._mailbox.dropped
             self.tally.dropped_images = self._mailbox.dropped_images
         if self._errors:
             raise self._errors[0]
         return self.tally
+
+    def _await_last_step(self) -> None:
+        try:
+            self._has_stepped.wait()
+        except KeyboardInterrupt:
+            raise StepInterrupt from None
+
+    def _step_all(self) -> None:
+        try:
+            self._guard(self._work)
+        finally:
+            self._has_stepped.set()
 
     def _guard(self, work: Callable[[], None]) -> None:
         try:
