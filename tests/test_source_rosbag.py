@@ -134,6 +134,16 @@ def test_colour_is_preferred_to_infrared_and_raw_to_compressed(tmp_path: Path) -
     assert len(list(make_source("mcap", path))) == 3
 
 
+def test_capital_letters_in_topics_do_not_change_their_meaning(tmp_path: Path) -> None:
+    """Names as librealsense records them."""
+    depth = {"Depth_0__image": (DEPTH, "mono16"), "Aligned_Depth__image": (DEPTH, "mono16")}
+    path = record(tmp_path / "a.mcap", Color_0__image=(COLOR, "rgb8"), **depth)
+    given = {"fx": 40.0, "fy": 41.0, "cx": 20.0, "cy": 15.0}
+    source = make_source("mcap", path, camera=given)
+    streams = {stream.sensor: stream.place for stream in source.survey().streams}
+    assert streams == {Sensor.IMAGE: "/Color_0/image", Sensor.DEPTH: "/Aligned_Depth/image"}
+
+
 def test_a_name_that_is_not_there_shows_what_is(tmp_path: Path) -> None:
     path = record(tmp_path / "a.mcap", rgb__image=(COLOR, "bgr8"))
     with pytest.raises(ConfigError, match=r"/rgb/image \(sensor_msgs/msg/Image\)") as caught:
@@ -228,7 +238,18 @@ def test_depth_goes_to_the_nearest_image_within_the_tolerance(tmp_path: Path) ->
     assert not any(one.has(Sensor.DEPTH) for one in strict)
 
 
-@pytest.mark.parametrize(("topic", "fx"), [("/cam/image_raw", 50.0), ("/cam/image_rect", 45.0)])
+@pytest.mark.parametrize(
+    ("topic", "fx"),
+    [
+        ("/cam/image_raw", 50.0),
+        ("/cam/direct_view", 50.0),
+        ("/cam/image_rect", 45.0),
+        ("/cam/image_rect_color", 45.0),
+        ("/cam/image_rectified", 45.0),
+        ("/cam/image_color_rect", 45.0),
+        ("/cam/rect/image", 45.0),
+    ],
+)
 def test_rectified_images_are_known_by_their_topic(tmp_path: Path, topic: str, fx: float) -> None:
     with Recorder(tmp_path / "a.mcap") as recorder:
         recorder.add("/cam/camera_info", STAMP_NS, camera_info(p=[45.0, 0, 20, 0, 0, 45.0, 15, 0]))

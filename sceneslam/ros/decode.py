@@ -80,7 +80,7 @@ def is_depth(message: Any, topic: str) -> bool:
     if is_compressed and "jp" not in encoding:
         stored = pixels.decode(message.data.tobytes(), cv2.IMREAD_UNCHANGED)
         return stored is not None and stored.dtype == np.uint16 and stored.ndim == 2
-    return kind == "mono16" and "depth" in topic
+    return kind == "mono16" and "depth" in topic.lower()
 
 
 def is_grey(message: Any) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -29,7 +30,8 @@ _NEEDS = {  # sensor -> field of BagTopics that names its topic
     Sensor.GYRO: "imu",
     Sensor.ACCELEROMETER: "imu",
 }
-_RECTIFIED = "image_rect"  # in the topics of image_proc and stereo_image_proc
+# Topics of image_proc and of other drivers, such as image_rect_color and image_color_rect.
+_RECTIFIED = re.compile(r"image_rect|(^|[/_])rect(?=[/_]|$)")
 _DEPTH_RANGE_M, _LIDAR_RANGE_M = (0.3, 8.0), (1.0, 100.0)
 
 
@@ -183,7 +185,7 @@ def _camera(
     recorded = None
     if info is not None and (given is None or given.distortion is None):
         try:
-            recorded = decode.camera(info, is_rectified=_RECTIFIED in picture)
+            recorded = decode.camera(info, is_rectified=bool(_RECTIFIED.search(picture)))
         except InputError as err:
             raise InputError(f"{err}; or give source.camera.fx, fy, cx, cy, distortion") from err
     if recorded is None and given is None:

@@ -75,7 +75,7 @@ def choose_topics(recording: Recording, given: Mapping[str, str | None]) -> BagT
         colors.remove(name)
     found = {
         "image": _without_grey(_one_transport(colors), firsts),
-        "depth": _prefer(_one_transport(depths), lambda name: "align" in name or "regist" in name),
+        "depth": _prefer(_one_transport(depths), _is_registered),
         **{need: _of_type(recording, TYPES[need]) for need in ("scan", "points")},
         "imu": [] if "imu" in chosen else _gyros_first(recording),
         "odometry": [n for n in _of_type(recording, TYPES["odometry"]) if not _is_truth(n)],
@@ -119,7 +119,7 @@ def inertial_sensors(
         if len(moved) == 2:
             break
     silent = said - moved if moved else set()
-    if is_live and "accel" not in topic:
+    if is_live and "accel" not in topic.lower():
         silent -= {Sensor.GYRO}
     for sensor in silent:
         _log.warning("%s holds no %s, only zeros", topic, sensor.value)
@@ -167,11 +167,17 @@ def _of_type(recording: Recording, types: Collection[str]) -> list[str]:
 
 
 def _is_truth(name: str) -> bool:
-    return "ground_truth" in name or "groundtruth" in name
+    return "ground_truth" in name.lower() or "groundtruth" in name.lower()
+
+
+def _is_registered(name: str) -> bool:
+    """Tell whether a depth topic's name says that depth is registered to the colour images."""
+    return "align" in name.lower() or "regist" in name.lower()
 
 
 def _is_8_bit_depth(name: str, message: Any) -> bool:
     """Tell whether the image is an 8-bit visualisation of depth, without its unit."""
+    name = name.lower()
     is_colour = "color" in name or "rgb" in name
     return "depth" in name and not is_colour and decode.is_grey(message)
 
