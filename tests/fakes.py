@@ -266,6 +266,12 @@ class IdleSink:
         pass
 
 
+class Display(IdleSink):
+    """A sink that writes no file."""
+
+    writes_files = False
+
+
 class FullDisk(IdleSink):
     """A sink that cannot write."""
 

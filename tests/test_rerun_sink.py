@@ -128,6 +128,11 @@ def test_a_sink_has_either_a_file_or_a_viewer(path):
         sink_to(path, viewer=viewer)
 
 
+def test_recording_writes_files_and_a_viewer_does_not():
+    assert sink_to("run.rrd").writes_files
+    assert not sink_to(None, viewer=Viewer(port=9876, web_port=None)).writes_files
+
+
 def test_ports_of_the_viewer_are_checked():
     with pytest.raises(ConfigError, match="web_port"):
         Viewer(port=9876, web_port=80)

@@ -10,7 +10,11 @@ import pytest
 from configured import config
 
 from sceneslam.app import run
+from sceneslam.sinks.foxglove import FoxgloveSink
+from sceneslam.sinks.mcap import McapSink
+from sceneslam.sinks.ros2.sink import Ros2Sink
 from sceneslam.storage.folder import RunFolder, give_back
+from sceneslam.storage.reserve import Reserve
 from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.files import MARK, finish, own, part_of, replacing
 
@@ -161,6 +165,19 @@ def test_a_file_of_a_sink_has_its_name_once_it_is_finished(tmp_path):
     (tmp_path / "other.mcap").touch()
     with pytest.raises(FileExistsError):
         own(tmp_path / "other.mcap")
+
+
+def test_a_full_disk_closes_the_sinks_that_write_files_alone(tmp_path, monkeypatch):
+    monkeypatch.setattr(Reserve, "is_enough", lambda self, poses: poses < 50)
+    sinks = {name: {"_target_": f"fakes.{name}"} for name in ("IdleSink", "Display")}
+    finished = run(config(run__report=False, sinks=sinks), tmp_path)
+    left = "[Errno 28] what is left is for the results"
+    assert finished.faults == (f"sinks.IdleSink stopped writing: OSError: {left}",)
+    assert len(finished.trajectory) == 100
+
+
+def test_sinks_on_a_network_write_no_files():
+    assert McapSink.writes_files and not Ros2Sink.writes_files and not FoxgloveSink.writes_files
 
 
 def test_the_mark_says_who_writes_and_what(tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,16 @@ from sceneslam.types.se3 import Transform
 from sceneslam.types.truth import GroundTruth
 
 _log = logging.getLogger(__name__)
+
+
+@runtime_checkable
+class SinkWithFiles(Protocol):
+    """A sink that says whether it writes files; one that does not say is taken to write some."""
+
+    @property
+    def writes_files(self) -> bool:
+        """Tell whether it has to be closed on a full disk."""
+        ...
 
 
 class OpenSinks:
@@ -91,10 +102,11 @@ class OpenSinks:
             except Exception as error:
                 self._drop(key, error)
 
-    def drop_all(self, error: Exception) -> None:
-        """Remove and close all sinks because of an error."""
-        for key in list(self._sinks):
-            self._drop(key, error)
+    def drop_files(self, error: Exception) -> None:
+        """Remove and close the sinks that write files because of an error."""
+        for key, sink in list(self._sinks.items()):
+            if not isinstance(sink, SinkWithFiles) or sink.writes_files:
+                self._drop(key, error)
 
     def abandon(self) -> None:
         """Close all sinks without results."""

@@ -27,6 +27,8 @@ class McapSink:
     observations from it; else it is for viewing only.
     """
 
+    writes_files = True
+
     def __init__(
         self, path: str, image_format: str, jpeg_quality: int, image_every: int, depth_every: int
     ) -> None:

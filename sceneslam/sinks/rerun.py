@@ -75,6 +75,11 @@ class RerunSink:
         self._truth: GroundTruth | None = None
         self._rr: Any = _import_rerun(required)
 
+    @property
+    def writes_files(self) -> bool:
+        """Tell whether it writes a recording."""
+        return self._path is not None
+
     def open(self, rig: Rig, folder: Path) -> None:
         """Start the file or the viewer, with a layout for the sensors that the rig has."""
         if self._rr is None:

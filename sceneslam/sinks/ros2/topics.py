@@ -51,6 +51,8 @@ class TopicSink:
     it does not relocalize the robot in an older map.
     """
 
+    writes_files = False
+
     def __init__(
         self,
         join: Callable[[], Transport],
