@@ -283,6 +283,8 @@ class RunLoop:
         module = self._parts.modules.get(self._bus.active)
         self._tally.add(observation, () if module is None else module.requires)
         self._keeping.keep(observation.stamp_ns)
+        if not self._keeping.has_room(len(self._observed_ns)):
+            self._sinks.drop_files(OSError(errno.ENOSPC, "what is left is for the results"))
         watch.lap("files")
         if self._sinks:
             self._write(observation)
@@ -308,8 +310,6 @@ class RunLoop:
 
     def _write(self, observation: Observation) -> None:
         """Pass the observation with its pose to the sinks, then the events."""
-        if not self._keeping.has_room(len(self._observed_ns)):
-            self._sinks.drop_files(OSError(errno.ENOSPC, "what is left is for the results"))
         atlas = self._parts.atlas
         T_map_base = atlas.pose_at(observation.stamp_ns)
         self._sinks.write(observation, T_map_base, atlas.last_covariance, self._bus.active)

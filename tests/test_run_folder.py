@@ -176,6 +176,13 @@ def test_a_full_disk_closes_the_sinks_that_write_files_alone(tmp_path, monkeypat
     assert len(finished.trajectory) == 100
 
 
+def test_room_on_the_disk_is_kept_also_without_sinks(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(Reserve, "is_enough", lambda self, poses: asked.append(poses) or True)
+    run(config(run__report=False), tmp_path)
+    assert asked == list(range(1, 101))
+
+
 def test_sinks_on_a_network_write_no_files():
     assert McapSink.writes_files and not Ros2Sink.writes_files and not FoxgloveSink.writes_files
 
