@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import resource
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -68,7 +68,10 @@ class Results:
         reference: Trajectory | None = None,
         has_costs: bool = True,
     ) -> Metrics:
-        """Write map, metrics and report; return the metrics."""
+        """Write map, metrics and report; return the metrics.
+
+        Their `errors` are all sentences in `faults`.
+        """
         compared = partial(
             evaluate,
             settings=self.evaluation,
@@ -85,6 +88,7 @@ class Results:
             metrics = None
         with self._noting("the metrics"):
             metrics = metrics or compared(result, None)  # those of the run alone
+            metrics["errors"] = list(self.faults)
             write_metrics(self.folder / "metrics.json", metrics)
         metrics = metrics or compared(_unevaluated(result), None)  # not written
         with self._noting("the ground truth"):
@@ -95,12 +99,23 @@ class Results:
         if self.has_report:
             with self._noting("the report"):
                 self._write_report(result, truth, metrics, reference)
+        self._add_errors(metrics)
         return metrics
 
     def lose(self, sentence: str) -> None:
         """Record what could not be saved."""
         self.unsaved.append(sentence)
         self.faults.append(sentence)
+
+    def _add_errors(self, metrics: Metrics) -> None:
+        """Add the errors of saving what comes after the metrics, also to their file."""
+        if metrics.get("errors") == self.faults:
+            return
+        metrics["errors"] = list(self.faults)
+        path = self.folder / "metrics.json"
+        if path.is_file():
+            with suppress(OSError):  # such as a full disk, which is an error of the run already
+                write_metrics(path, metrics)
 
     def _write_tum(self, trajectory: Trajectory, name: str) -> None:
         stamps_ns = logged_ns(self.source, trajectory.stamps_ns)

@@ -281,7 +281,8 @@ def test_ground_truth_that_cannot_be_written_costs_no_metrics(tmp_path, monkeypa
     assert finished.faults == (
         "the ground truth could not all be saved: OSError: the disk is full",
     )
-    assert (tmp_path / "metrics.json").exists()
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["errors"] == finished.metrics["errors"] == list(finished.faults)
 
 
 def test_a_module_that_leaves_the_folder_does_not_take_the_results_along(tmp_path, monkeypatch):

@@ -8,9 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from configured import config
 from evaluation_runs import loop, moved
 
 from sceneslam import run
+from sceneslam.app import run as run_config
 from sceneslam.compare import figures
 from sceneslam.compare.__main__ import main
 from sceneslam.compare.page import measured
@@ -100,6 +102,27 @@ def test_a_scripts_own_configurations(tmp_path, recording):
     assert done.metrics["poses"] == 30
     with pytest.raises(ConfigError, match="nowhere"):
         run(*words, config_dir=tmp_path / "nowhere", folder=tmp_path / "other")
+
+
+@pytest.mark.parametrize(
+    ("changes", "count"),
+    [
+        ({}, "none"),
+        ({"source__fault": "damaged at 2 s"}, "1"),
+        ({"slam__bright": {"_target_": "fakes.ExactModule", "raises": [20]}}, "1"),
+        ({"source__breaks_at": 70, "source__fault": "damaged at 2 s"}, "2"),
+    ],
+)
+def test_every_error_of_a_run_is_counted_once(tmp_path, changes, count):
+    run_config(config(run__report=False, **changes), tmp_path)
+    assert dict(measured(read_runs([tmp_path])))["faults"] == count
+
+
+def test_a_run_of_an_earlier_version_has_the_faults_that_it_names(runs):
+    (whole,) = read_runs([runs[0].folder])
+    metrics = {name: value for name, value in whole.metrics.items() if name != "errors"}
+    earlier = replace(whole, metrics=metrics | {"shortfalls": ["laser failed once"]})
+    assert dict(measured([earlier]))["faults"] == "1"
 
 
 def test_page_holds_what_was_measured_and_what_was_set_otherwise(runs, tmp_path, capsys):

@@ -29,7 +29,7 @@ _MEASURES: Sequence[_Measure] = (  # the measures of each run
     ("false switches", lambda m: number(m["false_switches"], 0)),
     ("speed, times real time", lambda m: number(m["realtime_factor"], 2, " ×")),
     ("peak memory", lambda m: number(m["peak_rss_mb"], 0, " MB")),
-    ("faults", lambda m: str(len(m["faults"]) + len(m["shortfalls"]) or "none")),
+    ("faults", lambda m: str(len({*m.get("errors", ()), *m["shortfalls"]}) or "none")),
 )
 
 
