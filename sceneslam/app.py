@@ -19,7 +19,7 @@ from sceneslam.evaluation.metrics import Metrics
 from sceneslam.evaluation.report.summary import summary_lines
 from sceneslam.interrupts import StopRequests, stop_requests
 from sceneslam.loop import RunLoop
-from sceneslam.results import Results
+from sceneslam.results import Results, reset_peak_rss
 from sceneslam.storage.folder import RunFolder, give_back
 from sceneslam.types.errors import ConfigError, SceneSlamError, text_of
 from sceneslam.types.maps import HybridMap
@@ -67,6 +67,7 @@ def run(
     KeyboardInterrupt if Ctrl-C is pressed twice while they are saved; the journal remains then.
     """
     _reclaim()
+    reset_peak_rss()
     with closing(build(config)) as parts:
         folder = folder.resolve()  # a module may leave the working directory
         with closing(RunFolder.claim(folder)) as claimed:

@@ -268,6 +268,15 @@ def test_metrics_that_fail_cost_neither_map_nor_report(tmp_path, monkeypatch):
     assert (tmp_path / "map" / "points.ply").exists() and (tmp_path / "report.html").exists()
 
 
+@pytest.mark.skipif(not os.access("/proc/self/clear_refs", os.W_OK), reason="only on Linux")
+def test_peak_memory_is_that_of_the_run_alone(tmp_path):
+    block = np.ones(60_000_000)  # 458 MB
+    first_mb = run(config(run__report=False), tmp_path / "one").metrics["peak_rss_mb"]
+    del block
+    second_mb = run(config(run__report=False), tmp_path / "two").metrics["peak_rss_mb"]
+    assert 400 < first_mb - second_mb < 600
+
+
 def test_ground_truth_that_cannot_be_written_costs_no_metrics(tmp_path, monkeypatch):
     write = Trajectory.write_tum
 
