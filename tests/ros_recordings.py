@@ -118,7 +118,15 @@ class Recorder:
         message = self._store.deserialize_cdr(data, "sensor_msgs/msg/CameraInfo")
         self.add(topic, stamp_ns, message)
 
-    def scan(self, topic: str, stamp_ns: int, ranges: list[float], **changes: float) -> None:
+    def scan(
+        self,
+        topic: str,
+        stamp_ns: int,
+        ranges: list[float],
+        *,
+        frame: str = "laser",
+        **changes: float,
+    ) -> None:
         fields = {
             "angle_min": -1.0,
             "angle_max": 1.0,
@@ -131,7 +139,7 @@ class Recorder:
         }
         message = self.new(
             "sensor_msgs/msg/LaserScan",
-            header=self.header(stamp_ns, "laser"),
+            header=self.header(stamp_ns, frame),
             ranges=np.array(ranges, np.float32),
             intensities=np.zeros(0, np.float32),
             **fields,

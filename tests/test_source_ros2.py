@@ -33,6 +33,8 @@ TYPES = {
     "/odom": "nav_msgs/msg/Odometry",
     "/imu": "sensor_msgs/msg/Imu",
     names.TF_STATIC: "tf2_msgs/msg/TFMessage",
+    "/husky/scan": "sensor_msgs/msg/LaserScan",
+    "/husky/tf_static": "tf2_msgs/msg/TFMessage",
     "/chatter": "std_msgs/msg/String",
 }
 CAMERA = Camera(size_wh=(8, 6), fx=5.0, fy=5.0, cx=4.0, cy=3.0)
@@ -51,7 +53,7 @@ class Robot:
 
     def publications(self):
         return [
-            Publication(topic=topic, msgtype=kind, is_latched=topic == names.TF_STATIC)
+            Publication(topic=topic, msgtype=kind, is_latched=topic.endswith(names.TF_STATIC))
             for topic, kind in self._topics.items()
         ]
 
@@ -88,11 +90,11 @@ class Robot:
             return encoder.odometry(stamp_ns, T_odom_base, names.ODOM)
         if topic == "/imu":
             return encoder.imu(stamp_ns, {Sensor.GYRO: np.array([0.0, 0.0, 0.5])})
-        if topic == "/scan":
+        if topic.endswith("/scan"):
             return encoder.scan(scan(stamp_ns))
         if topic == INFO:
             return encoder.camera_info(stamp_ns, CAMERA)
-        if topic == names.TF_STATIC:
+        if topic.endswith(names.TF_STATIC):
             return encoder.transforms(stamp_ns, names.BASE, self.mounts)
         if topic == IMAGE:
             return encoder.image(stamp_ns, np.full((6, 8, 3), 7, np.uint8), "bgr8")
@@ -307,6 +309,17 @@ def test_calibration_that_changes_is_named_and_the_run_goes_on(make):
     taken(source, 3)
     (event,) = told(source, "camera_info_changed")
     assert event["fx"] == 9.0
+
+
+def test_robot_in_a_namespace_has_its_own_transforms(make):
+    robot = Robot("/husky/scan", "/husky/tf_static")
+    source = make(robot)
+    np.testing.assert_allclose(heard(source, robot).laser.T_base_laser, T_BASE_LASER)
+    assert not list(source.survey().odd)
+    moved = {names.LASER: se3.identity()}
+    robot.send("/husky/tf_static", robot.encoder.transforms(1, names.BASE, moved))
+    source.close()
+    assert [one["event"] for one in source.notices()] == ["tf_changed"]
 
 
 def test_transforms_that_move_or_come_late_are_named(make):

@@ -396,6 +396,54 @@ def test_odometry_of_another_frame_is_brought_to_the_base(
 
 
 @pytest.mark.parametrize(
+    ("topic", "parent", "laser"),
+    [
+        ("/robot1/tf_static", "base_link", "laser"),
+        ("/robot1/tf", "base_link", "laser"),
+        ("/tf_static", "husky/base_link", "husky/laser"),
+    ],
+)
+def test_mounts_of_a_robot_with_a_namespace_are_known(
+    tmp_path: Path, topic: str, parent: str, laser: str
+) -> None:
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        tree = [transform(recorder, parent, laser, 0.5)]
+        recorder.add(topic, 0, recorder.new("tf2_msgs/msg/TFMessage", transforms=tree))
+        recorder.scan("/robot1/scan", STAMP_NS, [1.0, 2.0], frame=laser)
+    source = make_source("mcap", tmp_path / "a.mcap")
+    assert source.rig.laser.T_base_laser[0, 3] == 0.5
+    assert source.survey().unplaced == []
+
+
+@pytest.mark.parametrize(("robot", "x_m"), [("robot1", 0.1), ("robot2", 0.2)])
+def test_of_several_robots_the_one_whose_topics_are_used_places_its_sensors(
+    tmp_path: Path, robot: str, x_m: float
+) -> None:
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        for name, at_m in (("robot1", 0.1), ("robot2", 0.2)):
+            tree = [transform(recorder, "base_link", "laser", at_m)]
+            message = recorder.new("tf2_msgs/msg/TFMessage", transforms=tree)
+            recorder.add(f"/{name}/tf_static", 0, message)
+            recorder.scan(f"/{name}/scan", STAMP_NS, [1.0, 2.0], frame="laser")
+    source = make_source("mcap", tmp_path / "a.mcap", topics={"scan": f"/{robot}/scan"})
+    assert source.rig.laser.T_base_laser[0, 3] == x_m
+
+
+@pytest.mark.parametrize("robots", [("chassis",), ("one/base_link", "two/base_link")])
+def test_a_laser_without_a_known_base_is_named_where_there_are_transforms(
+    tmp_path: Path, robots: tuple[str, ...]
+) -> None:
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        tree = [transform(recorder, name, f"{name}_laser", 0.5) for name in robots]
+        recorder.add("/tf_static", 0, recorder.new("tf2_msgs/msg/TFMessage", transforms=tree))
+        recorder.scan("/scan", STAMP_NS, [1.0, 2.0], frame=f"{robots[0]}_laser")
+    source = make_source("mcap", tmp_path / "a.mcap")
+    assert source.survey().unplaced == [f"{robots[0]}_laser"]
+    placed = make_source("mcap", tmp_path / "a.mcap", base_frame=robots[0])
+    assert placed.survey().unplaced == [] and placed.rig.laser.T_base_laser[0, 3] == 0.5
+
+
+@pytest.mark.parametrize(
     ("connected", "unplaced"),
     [((), ["laser", "imu"]), (("laser",), ["imu"]), (("laser", "imu"), [])],
 )
@@ -420,7 +468,7 @@ def test_sensors_that_no_transform_places_are_named(
 @pytest.mark.parametrize(
     ("frame", "is_connected", "gyro_base", "unplaced"),
     [
-        ("gyro", True, [-2.0, 1.0, 3.0], []),  # as the camera's transforms say
+        ("gyro", True, [-2.0, 1.0, 3.0], ["cam"]),  # as the camera's transforms say
         ("gyro", False, [1.0, 2.0, 3.0], ["cam", "gyro"]),
         ("imu_optical_frame", False, [3.0, -1.0, -2.0], ["cam", "imu_optical_frame"]),
     ],

@@ -76,7 +76,7 @@ class RosBag:
             self._topics = choose_topics(self._recording, topics)
             self._by_sensor = sensor_topics(self._recording, self._topics)
             self._primary = self._choose_primary()
-            self._frames = FrameTree(self._recording, base_frame)
+            self._frames = FrameTree(self._recording, base_frame, self._by_sensor.values())
             self._rig = make_rig(self._recording, self._topics, self._frames, given)
             self._mounts = find_mounts(self._recording, self._topics, self._frames)
         except InputError as err:
@@ -138,9 +138,9 @@ class RosBag:
         return read_truth(self._recording, self._topics, self._frames, self._rig, self._truth_frame)
 
     def _unplaced(self) -> list[str]:
-        """Return the frames of sensors without a pose; a sensor alone may be the base itself."""
+        """Return the frames of sensors without a pose; without transforms, one may be the base."""
         found = unplaced(self._recording, self._topics, self._frames)
-        return found if self._frames.base is not None or len(found) > 1 else []
+        return [] if self._frames.is_empty and len(found) == 1 else found
 
     def _jobs(self) -> Iterator[Callable[[], Decoded]]:
         """Yield one decoding job per observation."""

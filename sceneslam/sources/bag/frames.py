@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from itertools import islice
 
 from sceneslam.ros import decode, names
@@ -15,13 +16,20 @@ _FIRST_MOVING = 200  # messages of /tf that are searched for sensor mounts
 
 
 class FrameTree:
-    """The transforms of /tf_static; for frames that are missing there, the first ones of /tf."""
+    """The transforms of /tf_static; for frames that are missing there, the first ones of /tf.
 
-    def __init__(self, recording: Recording, base_frame: str | None) -> None:
+    Both may be in a robot's namespace. Where several robots name their frames alike, those of the
+    namespace of the topics `used` hold.
+    """
+
+    def __init__(
+        self, recording: Recording, base_frame: str | None, used: Collection[str] = ()
+    ) -> None:
         self._up: dict[str, tuple[str, Transform]] = {}  # child -> parent, T_parent_child
-        for topic, count in ((names.TF_STATIC, None), (names.TF, _FIRST_MOVING)):
-            if topic not in recording.topics:
-                continue
+        topics = sorted(filter(is_of_transforms, recording.topics))
+        topics.sort(key=lambda topic: (not is_static(topic), not is_beside(topic, used)))
+        for topic in topics:
+            count = None if is_static(topic) else _FIRST_MOVING
             for message in islice(recording.messages({topic}), count):
                 for one in decode.transforms(recording.decode(message)):
                     self._up.setdefault(one.child, (one.parent, one.T_parent_child))
@@ -29,11 +37,16 @@ class FrameTree:
         if base_frame is not None and base_frame not in frames:
             known = ", ".join(sorted(frames)) or "it has no /tf_static and no /tf"
             raise ConfigError("base_frame", base_frame, f"null or one of the recording's: {known}")
-        self.base = base_frame or next((name for name in _BASES if name in frames), None)
+        self.base = base_frame or _base_of(frames)
+
+    @property
+    def is_empty(self) -> bool:
+        """Tell whether the recording has no transforms."""
+        return not self._up
 
     def is_base(self, frame: str) -> bool:
-        """Tell whether a frame is the base; without transforms, whether it has a base's name."""
-        return frame == self.base or (self.base is None and frame in _BASES)
+        """Tell whether a frame is the base; without a base, whether it has a base's name."""
+        return frame == self.base or (self.base is None and _last_part(frame) in _BASES)
 
     def T_base(self, frame: str) -> Transform | None:
         """Return T_base_frame (4, 4) [m]; None if no chain of transforms connects both."""
@@ -54,3 +67,36 @@ class FrameTree:
             met.add(frame)
             T_root_frame = T_parent_child @ T_root_frame
         return frame, T_root_frame
+
+
+def is_of_transforms(topic: str) -> bool:
+    """Tell whether a topic's name, in any namespace, is that of transforms."""
+    return is_static(topic) or _last_part(topic) == _last_part(names.TF)
+
+
+def is_static(topic: str) -> bool:
+    """Tell whether a topic's name, in any namespace, is that of transforms that do not change."""
+    return _last_part(topic) == _last_part(names.TF_STATIC)
+
+
+def is_beside(topic: str, used: Collection[str]) -> bool:
+    """Tell whether a topic's namespace holds one of the topics used."""
+    namespace = topic.rpartition("/")[0] + "/"
+    return any(one.startswith(namespace) for one in used)
+
+
+def _base_of(frames: Collection[str]) -> str | None:
+    """Return the frame with a base's name, else the one with it as its last part, if it is one."""
+    for name in _BASES:
+        if name in frames:
+            return name
+    for name in _BASES:
+        found = [frame for frame in frames if _last_part(frame) == name]
+        if found:
+            return found[0] if len(found) == 1 else None
+    return None
+
+
+def _last_part(name: str) -> str:
+    """Return the name without its namespace: laser of husky/laser."""
+    return name.rpartition("/")[2]

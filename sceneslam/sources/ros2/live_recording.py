@@ -11,6 +11,7 @@ from typing import Any
 from sceneslam.ros import names
 from sceneslam.ros.messages import MessageDecoder, TopicType
 from sceneslam.ros.transport.transport import Arrival, Publication, Qos, Transport
+from sceneslam.sources.bag.frames import is_of_transforms, is_static
 from sceneslam.sources.bag.recording import Message
 from sceneslam.sources.bag.topics import TYPES
 
@@ -18,7 +19,6 @@ _LOOK_S = 0.1  # interval of topic discovery
 _MOST_HELD = 400  # messages kept per topic ...
 _MOST_PICTURES = 40  # ... and per topic with messages of about a megabyte
 _PICTURES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/PointCloud2")
-_TF = (names.TF, names.TF_STATIC)
 _TF_TYPE = "tf2_msgs/msg/TFMessage"
 _NEEDS = ("image", "camera_info", "scan", "points", "odometry", "imu")
 
@@ -60,7 +60,7 @@ class LiveRecording:
         tick = threading.Event()
         while monotonic() < until_s:
             self._announce(transport)
-            if self.topics.keys() - set(_TF) and first_s is None:
+            if first_s is None and not all(map(is_of_transforms, list(self.topics))):
                 first_s = monotonic()
             listened_s = 0.0 if first_s is None else monotonic() - first_s
             is_all = listened_s >= listen_s and self.topics.keys() >= set(wanted)
@@ -85,10 +85,11 @@ class LiveRecording:
 
     def _qos(self, topic: str, publications: Sequence[Publication]) -> Qos:
         """Return what all of a topic's publishers offer."""
-        if topic not in _TF or not all(one.is_reliable for one in publications):
-            self.is_latched &= topic != names.TF_STATIC
+        is_reliable = all(one.is_reliable for one in publications)
+        if not is_of_transforms(topic) or not is_reliable:
+            self.is_latched &= not is_static(topic)
             return Qos.SENSOR
-        if topic == names.TF:
+        if not is_static(topic):
             return Qos.RELIABLE
         self.is_latched = any(one.is_latched for one in publications)
         return Qos.HISTORY if self.is_latched else Qos.RELIABLE
@@ -132,7 +133,7 @@ class LiveRecording:
 
 
 def _may_serve(topic: str, msgtype: str) -> bool:
-    if topic in _TF:
+    if is_of_transforms(topic):
         return msgtype == _TF_TYPE
     is_own = topic.startswith(names.OWN_PREFIX)
     return not is_own and any(msgtype in TYPES[need] for need in _NEEDS)

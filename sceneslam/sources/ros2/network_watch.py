@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from sceneslam.ros import decode, names
+from sceneslam.ros import decode
 from sceneslam.ros.messages import MessageDecoder, TopicType
 from sceneslam.ros.transport.transport import Arrival, Publication, Qos, Transport
 from sceneslam.types.errors import InputError
 from sceneslam.types.rig import Camera
 from sceneslam.types.se3 import Transform
 
+_TF_TYPE = "tf2_msgs/msg/TFMessage"
 _SAME = 1e-6  # of transforms, which come as float64
 
 Tell = Callable[..., None]  # event, and its fields
@@ -27,17 +28,22 @@ class NetworkWatch:
         types: Mapping[str, str],
         *,
         camera_info: str | None,
+        mounts: Collection[str],
         known: Sequence[Any],
         unplaced: Sequence[str],
         tell: Tell,
     ) -> None:
-        """Begin; `known` are the messages of `camera_info` and /tf_static so far."""
+        """Begin; `known` are the messages so far of `camera_info` and of `mounts`.
+
+        `mounts` are the topics of fixed transforms.
+        """
         self._types, self._tell = types, tell
         self._told: set[tuple[str, str]] = set()
         self._camera_info, self._unplaced = camera_info, list(unplaced)
+        self._mount_topics = sorted(mounts)
         self._decoder = MessageDecoder(
             {
-                names.TF_STATIC: TopicType.of_network("tf2_msgs/msg/TFMessage"),
+                **dict.fromkeys(self._mount_topics, TopicType.of_network(_TF_TYPE)),
                 camera_info or "": TopicType.of_network("sensor_msgs/msg/CameraInfo"),
             }
         )
@@ -54,9 +60,8 @@ class NetworkWatch:
         if self._camera_info is not None:
             kind = "sensor_msgs/msg/CameraInfo"
             transport.subscribe(self._camera_info, kind, self._take_camera)
-        transport.subscribe(
-            names.TF_STATIC, "tf2_msgs/msg/TFMessage", self._take_mounts, Qos.HISTORY
-        )
+        for topic in self._mount_topics:
+            transport.subscribe(topic, _TF_TYPE, self._take_mounts, Qos.HISTORY)
 
     def look(self, publications: Sequence[Publication]) -> None:
         """Report publishers with another type on a topic that is used."""

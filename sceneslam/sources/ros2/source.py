@@ -10,7 +10,7 @@ from sceneslam.ros import decode, names
 from sceneslam.ros.messages import MessageDecoder, TopicType
 from sceneslam.ros.pixels import DepthUnits
 from sceneslam.ros.transport.transport import Arrival, Network, Transport, open_transport
-from sceneslam.sources.bag.frames import FrameTree
+from sceneslam.sources.bag.frames import FrameTree, is_beside, is_static
 from sceneslam.sources.bag.observation import PRIMARY, BundleDecoder, measured
 from sceneslam.sources.bag.rig import (
     Given,
@@ -189,7 +189,7 @@ class Ros2(Measuring):
             self._by_sensor = sensor_topics(heard, self.topics, is_live=True)
             if not any(sensor in self._by_sensor for sensor in PRIMARY):
                 raise InputError("no image, depth, points, scan or odometry")
-            self.frames = FrameTree(heard, self._base_frame)
+            self.frames = FrameTree(heard, self._base_frame, self._by_sensor.values())
             self._rig = make_rig(heard, self.topics, self.frames, self._given)
             self._mounts = find_mounts(heard, self.topics, self.frames)
         except InputError as error:
@@ -216,10 +216,13 @@ class Ros2(Measuring):
         self._streams = Streams(self._by_sensor, self._silent_after_s, monotonic_ns())
         for topic in sorted(used):
             transport.subscribe(topic, types[topic], self._inbox.put)
-        followed = [topic for topic in (self.topics.camera_info, names.TF_STATIC) if topic]
+        fixed = {topic for topic in self.heard.topics if is_static(topic)}
+        mounts = {names.TF_STATIC, *(topic for topic in fixed if is_beside(topic, used))}
+        followed = [topic for topic in (self.topics.camera_info, *sorted(mounts)) if topic]
         self._network_watch = NetworkWatch(
             types,
             camera_info=self.topics.camera_info,
+            mounts=mounts,
             known=[self.heard.decode(one) for one in self.heard.messages(followed)],
             unplaced=self._unplaced(),
             tell=self._tell,
