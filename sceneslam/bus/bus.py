@@ -10,7 +10,7 @@ from time import perf_counter_ns
 from statemachine import State, StateMachine
 
 from sceneslam.bus.changeover import Candidates, Changeover, Outcome
-from sceneslam.bus.decision import GO_ON, Action, Decision, Situation, decide, in_json
+from sceneslam.bus.decision import BLIND, GO_ON, Action, Decision, Situation, decide, in_json
 from sceneslam.bus.estimator import Estimator
 from sceneslam.bus.judging.dead_reckoning import DeadReckoning
 from sceneslam.bus.judging.hold import Health
@@ -111,6 +111,7 @@ class Bus:
             catch_up_steps=catch_up_steps,
         )
         self._situation: Situation | None = None  # at the last decision
+        self._odom_ns: int | None = None  # stamp of the last odometry
         self._do: _Step  # what the state does with an observation
         self._go_on: _Step  # the same for the observation at which the state was entered
         self._machine = BusMachine(self)
@@ -143,6 +144,8 @@ class Bus:
         self._watch.look(observation)
         observation = self._reckoning.correct(observation, self.active)
         self._changeover.submit(observation)
+        if observation.T_odom_base is not None:
+            self._odom_ns = observation.stamp_ns
         witness = self._reckoning.witness
         self._estimator.track(observation, witness, by_velocity=self._has_other())
         self._reckoning.learn(self._estimator.session.hold, self.active)
@@ -210,6 +213,10 @@ class Bus:
         return Outcome.SUCCESS
 
     def _change_over(self, observation: Observation) -> Outcome | None:
+        confirmed = self._watch.confirmed
+        if confirmed is not None and self._changeover.is_over(confirmed.scene):
+            self._changeover.give_up()
+            return Outcome.FAILURE
         return self._changeover.go_on()
 
     def _decide(self, observation: Observation) -> Outcome | None:
@@ -242,9 +249,16 @@ class Bus:
         """Tell whether another module could take over, or the failed one could return."""
         return any(key != self.active for key in self._candidates.of(self.scene))
 
+    def _has_odometry(self, stamp_ns: int) -> bool:
+        """Tell whether odometry came lately; a single message may be late."""
+        if self._odom_ns is None:
+            return False
+        return stamp_ns - self._odom_ns <= BLIND * self._policy.lost_patience_s * 1e9
+
     def _look(self, observation: Observation) -> Situation:
         """Return all that is known at an observation."""
         hold, health = self._estimator.session.hold, self._estimator.session.health
+        is_unled = hold.wheels_lie or not self._has_odometry(observation.stamp_ns)
         confirmed = self._watch.confirmed
         scene = self.scene if confirmed is None else confirmed.scene
         return Situation(
@@ -255,7 +269,7 @@ class Bus:
             health=health,
             unheld_since_ns=hold.unheld_since_ns or 0,
             held_ns=hold.held_ns,
-            is_blind=health is Health.LOST and (observation.T_odom_base is None or hold.wheels_lie),
+            is_blind=health is Health.LOST and is_unled,
             choices=self._candidates.of(scene),
             served_choices=self._candidates.of(self.scene),
             tried=self._candidates.tried,

@@ -170,6 +170,18 @@ class Changeover:
             self.tell_scene()
         return Outcome.FAILURE
 
+    def is_over(self, scene: str) -> bool:
+        """Tell whether the scene that called for the change is over while the old module tracks."""
+        is_other = self._verdict.reason == "scene" and scene != self._candidates.scene
+        return is_other and self._estimator.session.health is Health.HELD
+
+    def give_up(self) -> None:
+        """End the change; the active module stays."""
+        self.queue = []
+        if self._attempt is not None:
+            self._log_choice("refused", self._attempt.runner.key, why="the scene is over")
+        self._end_attempt()
+
     def tell_scene(self) -> None:
         """Inform the active module, which stays, of the scene that it serves now."""
         assert self._estimator.active is not None
@@ -219,6 +231,9 @@ class Changeover:
     def close(self) -> None:
         """Shut down every module that is being started."""
         self._drop_trial()
+        self._end_attempt()
+
+    def _end_attempt(self) -> None:
         if self._attempt is not None:
             self._attempt.runner.retire()
             self._attempt = None

@@ -65,7 +65,7 @@ class Decision:
 
 
 DOUBLINGS = 3  # of a wait after a failure, at most: from 2 s to 16 s
-_BLIND = 0.1  # share of the patience: constant velocity errs more than ten times as much as wheels
+BLIND = 0.1  # share of the patience: constant velocity errs more than ten times as much as wheels
 GO_ON = Decision(action=Action.GO_ON)
 
 
@@ -112,7 +112,7 @@ def _decide_on_loss(policy: Policy, now: Situation) -> Decision:
         left, rounds = others, now.rounds + 1
     if _is_adrift(policy, now):
         left = (*left, now.active)  # anew, with an empty map
-    patience_s = policy.lost_patience_s * (_BLIND if now.is_blind else 1.0)
+    patience_s = policy.lost_patience_s * (BLIND if now.is_blind else 1.0)
     is_over = now.health is Health.FAILED or lost_ns >= round(patience_s * 1e9)
     is_waiting = not left and not now.active and now.may_return
     if not is_over or is_waiting or (not left and now.health is not Health.FAILED):

@@ -34,7 +34,8 @@ class Estimator:
     ) -> None:
         self._policy, self._rig, self._back_end, self._log = policy, rig, back_end, log
         # The active module's; the paper's (cold) hand-over uses its last pose and nothing after it.
-        self.session = self._new_session(None, Bridge(is_active=policy.handover != "cold"))
+        bridge = Bridge(is_active=policy.handover != "cold")
+        self.session = self._new_session(None, bridge, lie_until_ns=-1)
         self._memory = ObservationBuffer(  # of the newest observation alone, unless it rewinds
             span_s=policy.buffer_s if policy.handover == "rewind" else 0.0,
             limit_mb=policy.buffer_mb,
@@ -92,7 +93,8 @@ class Estimator:
         anchor = self._memory.newest if is_trial else self._memory.anchor(since_ns)
         if from_ns is not None:
             anchor = self._memory.after(from_ns - 1)[0]
-        session = self._new_session(runner, anchor.bridge.copy())
+        lie_until_ns = self.session.hold.lie_until_ns
+        session = self._new_session(runner, anchor.bridge.copy(), lie_until_ns=lie_until_ns)
         return Handover(session, self._memory, anchor=anchor, pace=Pace(self._policy.catch_up))
 
     def accept(self, handover: Handover) -> None:
@@ -110,8 +112,9 @@ class Estimator:
 
     def retire(self) -> None:
         """Shut the active module down and keep its map."""
-        self._retire(self.session)
-        self.session = self._new_session(None, self.session.bridge)
+        old = self.session
+        self._retire(old)
+        self.session = self._new_session(None, old.bridge, lie_until_ns=old.hold.lie_until_ns)
 
     def close(self) -> None:
         """Shut the active module down, and delete the buffered observations."""
@@ -153,6 +156,10 @@ class Estimator:
             is_jump = last.tracking is not None and last.tracking.revision != answer.revision
             bridge.update(each.observation, T_map_base, is_jump=is_jump)
             last = replace(each, T_map_base=T_map_base, module=runner.key, bridge=bridge.copy())
+            if (
+                suspicion.noticed_ns <= each.stamp_ns < moment.stamp_ns
+            ):  # else it is doubted already
+                last = replace(last, tracking=self.session.doubted(answer))
             told.append(last)
             missed = []
             if suspicion.noticed_ns <= each.stamp_ns < moment.stamp_ns:
@@ -253,8 +260,10 @@ class Estimator:
                 layers = legacy.layers if session == stored[-1] else MapLayers()
                 self._back_end.close_session(session, layers, legacy.trajectory)
 
-    def _new_session(self, runner: Runner | None, bridge: Bridge) -> ModuleSession:
-        settings = self._policy.gate
-        gate = None if settings is None else Gate(settings, self._rig.wheels)
+    def _new_session(
+        self, runner: Runner | None, bridge: Bridge, *, lie_until_ns: int
+    ) -> ModuleSession:
+        settings, wheels = self._policy.gate, self._rig.wheels
+        gate = None if settings is None else Gate(settings, wheels, lie_until_ns=lie_until_ns)
         hold = Hold(patience_ns=round(self._policy.lost_patience_s * 1e9), gate=gate)
         return ModuleSession(runner, hold, bridge)

@@ -88,7 +88,7 @@ class ModuleSession:
                 self.hold.spare(observation)
             if self.tracking is not None:
                 T_map_tracked = self._place(observation, self.tracking)
-                self.tracking = self._doubted(self.tracking)
+                self.tracking = self.doubted(self.tracking)
                 return self._moment(observation, T_map_tracked, witness)
         except ModuleError as error:
             self.fault, self.tracking = error, None
@@ -109,13 +109,16 @@ class ModuleSession:
         T_prev_curr: Transform | None,
     ) -> Transform | None:
         """Return T_map_base (4, 4) by a bridge, which continues from it; None if it is unknown."""
-        if self.hold.wheels_lie and self.is_running:
-            observation = replace(observation, T_odom_base=None)
+        observation = self._believed(observation)
         turn = self.hold.turn if self.is_running else None
         T_map_base = bridge.predict(observation, by_velocity=by_velocity, turn=turn)
         if T_map_base is None and T_prev_curr is not None:
             T_map_base = bridge.follow(observation, T_prev_curr)
         return T_map_base
+
+    def _believed(self, observation: Observation) -> Observation:
+        """Return an observation without the odometry of wheels that lie."""
+        return replace(observation, T_odom_base=None) if self.hold.wheels_lie else observation
 
     def _ask(self, observation: Observation, witness: Witness) -> Tracking | None:
         """Return the module's answer if it may be used; raises ModuleError as the runner does."""
@@ -134,7 +137,8 @@ class ModuleSession:
     def _place(self, observation: Observation, tracking: Tracking) -> Transform:
         """Return T_map_base; a module's first pose is the bridged one, handed over (Eq. 1)."""
         if not self.is_placed:
-            self.settle(tracking, self.bridge.predict(observation, by_velocity=True))
+            T_map_base = self.bridge.predict(self._believed(observation), by_velocity=True)
+            self.settle(tracking, T_map_base)
             self.is_placed = True
         assert self.runner is not None and self.runner.T_map_local is not None
         T_map_base = self.runner.T_map_local @ tracking.T_local_base
@@ -148,7 +152,7 @@ class ModuleSession:
         self._placed = tracking, unknown if T_map_base is None else None
         self.runner.place(self.bridge.T_map_base @ se3.inverse(tracking.T_local_base))
 
-    def _doubted(self, tracking: Tracking) -> Tracking:
+    def doubted(self, tracking: Tracking) -> Tracking:
         """Return an answer whose map's covariance counts from where the module was placed.
 
         What its map drifted before is no part of it; how uncertain that place is, is.

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.types import se3
+from sceneslam.types.covariance import semidefinite
 from sceneslam.types.maps import LAYER_TYPES, GridLayer, MapLayers
 from sceneslam.types.observation import Tracking, TrackingStatus
 from sceneslam.types.trajectory import Trajectory
@@ -161,12 +162,14 @@ def _check_rigid(name: str, T_a_b: NDArray[np.float64]) -> None:
 
 
 def _covariance(name: str, covariance: object) -> NDArray[np.float64] | None:
-    """Return a copy of a covariance (6, 6), None without one."""
+    """Return a copy of a covariance (6, 6) without its negative parts, None without one."""
     if covariance is None:
         return None
     matrix = np.array(_of(name, covariance, np.ndarray), np.float64)
     _check_shape(name, matrix, (6, 6))
     if not (np.isfinite(matrix).all() and (matrix.diagonal() >= 0).all()):
         raise ValueError(f"{name}: expected finite numbers, none below 0 on the diagonal")
+    if np.linalg.eigvalsh(matrix)[0] < 0.0:
+        matrix = semidefinite(matrix)
     matrix.flags.writeable = False
     return matrix

@@ -111,7 +111,9 @@ class Gate:
     more, the module's scale is wrong, even though it seldom differs by as much as `sigmas`.
     """
 
-    def __init__(self, settings: GateSettings, wheels: Wheels) -> None:
+    def __init__(self, settings: GateSettings, wheels: Wheels, *, lie_until_ns: int = -1) -> None:
+        """Begin; wheels that another module showed to be wrong are not believed for some time."""
+        self.lie_until_ns = lie_until_ns  # so long the wheels lie, if no module tracks
         self._sigmas, self._wheels = settings.sigmas, wheels
         self._samples: list[_Sample] = []  # by rising stamp, back to the longest horizon
         self._first: _Sample | None = None  # with which the activation began
@@ -156,8 +158,7 @@ class Gate:
             self._way_m += _norm(T_odom_base[:3, 3] - T_odom_prev[:3, 3])
             self._turn_rad += _angle_rad(T_odom_base[:3, :3] - T_odom_prev[:3, :3])
         if T_local_base is None:
-            lie = self._unchecked.wheels_lie
-            lie = lie and stamp_ns - self._samples[-1].stamp_ns <= _HORIZONS_NS[-1]
+            lie = stamp_ns <= self.lie_until_ns
             self._unchecked = replace(self._unchecked, wheels_lie=lie)
             return Judgement(is_trusted=False, wheels_lie=lie)
         if self._is_revised and self._samples:
@@ -171,7 +172,11 @@ class Gate:
             turn_rad=self._turn_rad,
             missed_rad=witness.missed_rad,
         )
-        judgement = self._judge(now, deviation_m, witness) if self._samples else self._begin(now)
+        if self._samples:
+            judgement = self._judge(now, deviation_m, witness)
+            self.lie_until_ns = stamp_ns + _HORIZONS_NS[-1] if judgement.wheels_lie else -1
+        else:
+            judgement = self._begin(now)
         self._samples.append(now)
         self._unchecked = Judgement(
             is_trusted=judgement.is_trusted, wheels_lie=judgement.wheels_lie
@@ -191,7 +196,7 @@ class Gate:
     def _begin(self, now: _Sample) -> Judgement:
         self._first, self._within_since_ns = now, now.stamp_ns
         self._usual(now, 0.0)
-        return Judgement(is_trusted=False)
+        return Judgement(is_trusted=False, wheels_lie=now.stamp_ns <= self.lie_until_ns)
 
     def _judge(self, now: _Sample, deviation_m: float | None, witness: Witness) -> Judgement:
         found = self._anchors(now.stamp_ns)

@@ -58,6 +58,11 @@ class Hold:
         self._intervals_ns: deque[int] = deque(maxlen=3)  # between their last data
 
     @property
+    def lie_until_ns(self) -> int:
+        """Return until when the wheels lie, as far as is known."""
+        return -1 if self._gate is None else self._gate.lie_until_ns
+
+    @property
     def is_held(self) -> bool:
         """Tell whether the module tracks, as far as is known."""
         return self.held_since_ns is not None
@@ -105,6 +110,7 @@ class Hold:
     def spare(self, observation: Observation) -> None:
         """Record an observation that is not given to the module."""
         self.is_trusted, self.answer, self.tracking = False, None, None
+        self.is_revised = False
         self._judge(observation, None)
 
     @property
@@ -117,7 +123,7 @@ class Hold:
     def _feed(self, tracking: Tracking) -> None:
         if self._fed_ns is not None:
             self._intervals_ns.append(tracking.stamp_ns - self._fed_ns)
-        self._fed_ns, self.status = tracking.stamp_ns, tracking.status
+        self._fed_ns, self.status, self.is_revised = tracking.stamp_ns, tracking.status, False
         if tracking.status is TrackingStatus.LOST:  # its pose is the one before
             if not tracking.can_begin:
                 self.adrift_since_ns = None

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
 from sceneslam.types.observation import UNSURE, SceneVote
+
+_USUAL = 3  # the least of so many intervals between votes is the usual one
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,17 +49,21 @@ class WindowFilter:
         self._candidate: str | None = None
         self._candidate_since_ns = 0
         self._last_ns = 0
+        self._intervals_ns: deque[int] = deque(maxlen=_USUAL)  # of the last votes
         self._scene: str | None = None  # confirmed last, None before the first
 
     def update(self, vote: SceneVote) -> ConfirmedScene | None:
         """Return the scene that this vote confirms, None when nothing changes.
 
-        After a gap between votes longer than the window, the window restarts.
+        After an unusual gap between votes, longer than the window, the window restarts.
         """
         if vote.scene == UNSURE:
             return None
         window_ns = self._first_window_ns if self._scene is None else self._window_ns
-        silent = vote.stamp_ns - self._last_ns > window_ns
+        interval_ns = vote.stamp_ns - self._last_ns
+        usual_ns = min(self._intervals_ns) if len(self._intervals_ns) == _USUAL else 0
+        silent = interval_ns > max(window_ns, 2 * usual_ns)
+        self._intervals_ns.append(interval_ns)
         if vote.scene != self._candidate or silent:
             self._candidate, self._candidate_since_ns = vote.scene, vote.stamp_ns
         self._last_ns = vote.stamp_ns

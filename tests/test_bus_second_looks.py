@@ -1,0 +1,133 @@
+"""The bus: what was known a moment ago is not forgotten, and what is over is not carried out."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from driving import GATE, drive, events
+from fakes import PERIOD_NS, ExactModule, observation, true_pose
+from test_acquittal import OPTIONS, Uncertain, frozen
+
+from sceneslam.bus.scene.scene_filter import WindowFilter
+from sceneslam.types import se3
+from sceneslam.types.observation import SceneVote, TrackingStatus
+
+ALONE = {"Bright": ["bright"], "Dark": ["bright"]}
+
+
+def decisions(log):
+    return [
+        (each["stamp_ns"] // PERIOD_NS, each["to"], each["reason"])
+        for each in events(log, "decision")
+    ]
+
+
+class Certain(ExactModule):
+    """Knows its motion; its covariance is `known`."""
+
+    known = 1e-6 * np.eye(6)
+
+    def track(self, observation):
+        tracking = super().track(observation)
+        if tracking.status is TrackingStatus.LOST:
+            return tracking
+        return replace(tracking, covariance=self.known, inliers=10)
+
+
+class Jumping(Certain):
+    """Corrects its past at 50; from 55 on it is 2 m off, without a word."""
+
+    def track(self, observation):
+        tracking, index = super().track(observation), observation.stamp_ns // PERIOD_NS
+        off = se3.from_xy_yaw(2.0 if index >= 55 else 0.0, 0.0, 0.0)
+        T_local_base = off @ tracking.T_local_base
+        return replace(tracking, T_local_base=T_local_base, revision=int(index >= 50))
+
+
+def test_a_covariance_that_is_not_positive_ends_no_run():
+    module = Certain()
+    module.known = 1e-3 * np.eye(6)
+    module.known[0, 1] = module.known[1, 0] = -0.01
+    _, atlas, _, _ = drive({"bright": module}, steps=60, table=ALONE, gate=GATE)
+    assert len(atlas.trajectory) == 60
+
+
+@pytest.mark.parametrize("is_lost", [True, False])
+def test_an_earlier_correction_hides_no_later_jump(is_lost):
+    """Between them it is lost, or has no image."""
+
+    def feed(index):
+        given = observation(index)
+        return replace(given, image_bgr=None) if 51 <= index < 55 and not is_lost else given
+
+    module = Jumping(lost=range(51, 55) if is_lost else ())
+    options = {"handover": "rewind", "lost_patience_s": 1.0, "feed": feed}
+    _, atlas, log, _ = drive({"bright": module}, table=ALONE, gate=GATE, **options)
+    assert events(log, "suspect")[0]["stamp_ns"] // PERIOD_NS == 55
+    off_m = atlas.trajectory.T_world_base[-1, :3, 3] - true_pose(99 * PERIOD_NS)[:3, 3]
+    np.testing.assert_allclose(off_m, 0.0, atol=0.05)
+
+
+def test_wheels_that_lie_do_not_place_a_fallback():
+    """The wheels spin from 40 on; the module is lost from 60 on, its fallback tracks from 66 on."""
+
+    def feed(index):
+        spun = se3.from_xy_yaw(0.1 * max(index - 40, 0), 0.0, 0.0)
+        return replace(observation(index), T_odom_base=spun @ true_pose(index * PERIOD_NS))
+
+    modules = {"bright": Certain(lost=range(60, 1000)), "dark": Certain(lost=range(66))}
+    _, atlas, log, _ = drive(
+        modules, steps=110, gate=GATE, feed=feed, handover="rewind", lost_patience_s=1.0
+    )
+    believed = [each["stamp_ns"] // PERIOD_NS for each in events(log, "odometry")]
+    assert 40 < believed[0] < 45 and min(believed[1:], default=66) >= 66
+    off_m = atlas.trajectory.T_world_base[-1, :3, 3] - true_pose(109 * PERIOD_NS)[:3, 3]
+    assert np.linalg.norm(off_m) < 0.2
+
+
+def test_a_scene_that_is_over_changes_no_module():
+    """Dark lasts for 3 s, and its module takes 6 s to start."""
+    modules = {"bright": ExactModule(), "dark": ExactModule()}
+    _, atlas, log, _ = drive(
+        modules,
+        steps=250,
+        scene_at=lambda index: "Dark" if 40 <= index < 70 else "Bright",
+        handover="rewind",
+        startup_s={"dark": 6.0},
+    )
+    assert [to for _, to, _ in decisions(log)] == ["bright"]
+    assert [(each["to"], each["why"]) for each in events(log, "refused")] == [
+        ("dark", "the scene is over")
+    ]
+    assert modules["bright"].activations == 1 and set(atlas.pose_modules) == {"bright"}
+
+
+def test_one_observation_without_odometry_leaves_the_patience_as_it_is():
+    modules = {"bright": ExactModule(lost=range(50, 55)), "dark": ExactModule()}
+
+    def feed(index):
+        return observation(index, has_odometry=index != 52)
+
+    options = {"handover": "rewind", "lost_patience_s": 1.5}
+    _, _, log, _ = drive(modules, feed=feed, **options)
+    assert [to for _, to, _ in decisions(log)] == ["bright"]
+
+
+def test_votes_rarer_than_the_window_confirm_a_scene():
+    window = WindowFilter(window_s=1.0, first_window_s=0.0)
+    scenes = ["Indoor"] * 6 + ["Outdoor"] * 4
+    votes = [SceneVote(stamp_ns=k * 1_033_000_000, scene=one) for k, one in enumerate(scenes)]
+    confirmed = [(k, found.scene) for k, vote in enumerate(votes) if (found := window.update(vote))]
+    assert confirmed == [(0, "Indoor"), (7, "Outdoor")]
+
+
+def test_acquitted_poses_do_not_carry_the_drift_of_before_the_module_was_placed():
+    class Drifting(Uncertain):
+        def track(self, observation):
+            tracking = super().track(observation)
+            is_lost = tracking.status is TrackingStatus.LOST
+            return tracking if is_lost else replace(tracking, map_covariance=0.5 * np.eye(6))
+
+    _, atlas, log, _ = drive({"bright": Drifting()}, feed=frozen(40), **OPTIONS)
+    assert events(log, "suspect")
+    assert atlas._path.of_maps()[:, 0, 0].max() < 0.1
