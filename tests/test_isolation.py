@@ -199,6 +199,16 @@ def test_the_death_of_an_idle_process_costs_nothing(isolated):
     assert active(module).track(seen(0)) is not None
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_requests_to_stop_are_left_to_the_parent(isolated, number):
+    before = process_ids()
+    module = active(isolated(ExactModule))
+    module.track(seen(0))
+    (pid,) = process_ids() - before
+    os.kill(int(pid), number)
+    assert module.track(seen(1)) is not None and module.get_map() is not None
+
+
 def test_no_process_is_left_behind(isolated):
     before = process_ids()
     kept, dropped = isolated(ExactModule), IsolatedModule("x", ExactModule, limits())

@@ -306,6 +306,14 @@ def test_a_program_that_does_wrong_is_stopped_and_nothing_else(kind):
     assert case.harm == ()
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_program_leaves_requests_to_stop_to_its_parent(started, number):
+    module = echo(started)
+    os.kill(module._running._popen.pid, number)
+    assert module.track(observation(0)).status is TrackingStatus.TRACKING
+    assert module.get_map() is not None
+
+
 def test_a_program_that_is_killed_is_replaced_by_the_fallback_and_comes_back(started):
     module = started(sys.executable, PROGRAM, start_deadline_s=30.0)
 

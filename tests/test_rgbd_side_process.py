@@ -39,6 +39,14 @@ def test_side_process_does_tasks_in_order_and_keeps_its_state():
     assert not runs(pid)
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_side_process_leaves_requests_to_stop_to_its_parent(number):
+    process = SideProcess(Counter, 0)
+    os.kill(process.submit("pid").result(), number)
+    assert process.submit(1).result() == 1
+    process.end()
+
+
 def test_side_process_that_was_killed_is_a_module_error():
     process = SideProcess(Counter, 0)
     os.kill(process.submit("pid").result(), signal.SIGKILL)

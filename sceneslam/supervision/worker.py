@@ -108,7 +108,12 @@ def _die_with_parent(lifeline: int) -> None:
 
 
 def main(line: int, lifeline: int) -> None:
-    """Serve on the inherited descriptors; Ctrl-C is handled by the parent."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """Serve on the inherited descriptors.
+
+    Requests to stop, which may reach all processes of a service, are the parent's to handle: it
+    still asks for poses and maps.
+    """
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
     _die_with_parent(lifeline)
     serve(Channel(socket.socket(fileno=line)))

@@ -39,13 +39,16 @@ _LAST_WORDS_CHARS = 300
 _LINES_MAX = 1000  # stored lines of a program's log
 _PATIENCE_S = 1.0  # for a program to end after its input was closed
 # The program's memory is limited, and the kernel ends it when the other end of the lifeline closes,
-# as for the processes of modules (`supervision/worker.py`); both settings survive exec.
+# as for the processes of modules (`supervision/worker.py`). Requests to stop are the parent's to
+# handle, which still asks for the map. All of these settings survive exec.
 _LAUNCH = """
 import fcntl, os, resource, signal, sys
 lifeline, limit = map(int, sys.argv[1:3])
 fcntl.fcntl(lifeline, fcntl.F_SETOWN, os.getpid())
 fcntl.fcntl(lifeline, fcntl.F_SETFL, fcntl.fcntl(lifeline, fcntl.F_GETFL) | os.O_ASYNC)
 signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+    signal.signal(number, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
 os.execvp(sys.argv[3], sys.argv[3:])
 """

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -51,7 +52,12 @@ class SideProcess(Generic[Task, Result]):
 
 
 def main() -> None:
-    """Process tasks from standard input until it is closed; answers go to standard output."""
+    """Process tasks from standard input until it is closed; answers go to standard output.
+
+    Requests to stop are the parent's to handle, which still waits for answers.
+    """
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
     output = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # whatever a library prints
     build, arguments = pickle.load(sys.stdin.buffer)
