@@ -1,6 +1,7 @@
 """Maps of several runs: what is kept, forgotten, joined, saved, and when."""
 
 from dataclasses import replace
+from itertools import accumulate
 
 import numpy as np
 import pytest
@@ -136,6 +137,16 @@ def test_a_base_that_is_mounted_askew_stands_askew_whichever_way_it_looks():
     saved = replace(map_of(*[WALL] * 3), T_map_node=np.stack(nodes))
     drifted = back @ pitched @ se3.exp(np.array([0.0, 0.0, 0.0, 0.02, 0.03, 0.0]))
     np.testing.assert_allclose(saved.standing(drifted)[:3, 2], (back @ pitched)[:3, 2], atol=1e-3)
+
+
+def test_above_a_long_ramp_a_robot_stands_level_whichever_way_it_looks():
+    ahead, turn = se3.from_xy_yaw(2.5, 0.0, 0.0), se3.from_xy_yaw(0.0, 0.0, np.pi / 2)
+    up, level = se3.exp(-PITCHED), se3.exp(PITCHED)
+    steps = [up, *[ahead] * 12, ahead @ level, *[ahead @ turn, ahead] * 4]
+    nodes = np.array(list(accumulate(steps, np.matmul)))
+    saved = replace(map_of(*[WALL] * len(nodes)), T_map_node=nodes)
+    back = nodes[13] @ se3.from_xy_yaw(0.5, 0.0, np.pi)
+    np.testing.assert_allclose(saved.standing(back), back, atol=1e-9)
 
 
 # What is covered.

@@ -10,6 +10,7 @@ from test_atlas_submaps import Known, S, at, collector, pitched, run_of
 
 from sceneslam.atlas.places.localizer import Fix
 from sceneslam.atlas.submaps import run_graph
+from sceneslam.atlas.submaps.chain import Chain
 from sceneslam.atlas.submaps.graph import connected, on_floor
 from sceneslam.atlas.submaps.run_graph import RunGraph
 from sceneslam.atlas.submaps.uprights import straightened, uprights
@@ -141,11 +142,12 @@ def tilted(tilts, run):
 
 def test_a_run_is_straightened_by_its_own_usual_tilt():
     unknown = replace(tilted([0.0, 0.0, 0.0], 0)[0], up=None)
-    submaps = straightened([*tilted([0.10, 0.12, 0.10], 0), unknown])
+    run = [*tilted([0.10, 0.12, 0.10], 0), unknown]
+    submaps = straightened(Chain(submaps=run, T_run_node=[at()] * 4))
     assert submaps[-1].up is None
     for submap, tilt in zip(submaps, [0.0, 0.02, 0.0], strict=False):
         np.testing.assert_allclose(submap.up, pitched(0, 0, tilt)[2, :3], atol=1e-9)
-    assert straightened(submaps[-1:]) == submaps[-1:]
+    assert straightened(Chain(submaps=[unknown], T_run_node=[at()])) == [unknown]
 
 
 def test_submaps_are_held_upright_as_the_first_one_is():

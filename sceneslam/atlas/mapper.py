@@ -241,7 +241,7 @@ class Mapper:
             *(place for place in self._places() if fits(place, T_map_node)),
         ]
         saved = SavedMap(
-            submaps=(*self._loaded.submaps, *straightened(own.submaps)),
+            submaps=(*self._loaded.submaps, *straightened(own)),
             T_map_node=T_map_node,
             pieces=np.concatenate([self._loaded.pieces, self._own_pieces(loops)]),
             edges=(

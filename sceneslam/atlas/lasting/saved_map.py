@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from sceneslam.atlas.places.floor_plan import FloorPlan, check_size, join
 from sceneslam.atlas.submaps.graph import connected, fits
 from sceneslam.atlas.submaps.submap import Drawing, Submap
+from sceneslam.atlas.submaps.uprights import are_steady
 from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.motion.tilt import upright
 from sceneslam.types import planar, se3
@@ -140,10 +141,13 @@ class SavedMap:
         """Return a pose (4, 4) with the height and tilt of a robot on the floor of a piece there.
 
         That is the floor of the submap that begins nearest to it. A base that is mounted askew has
-        the same tilt everywhere.
+        the same tilt everywhere, whichever way it looks; on a ramp it has not.
         """
-        up_base = np.median(self.T_map_node[self.pieces == piece, 2, :3], axis=0)
-        askew = upright(se3.identity(), up_base)
+        nodes = self.T_map_node[self.pieces == piece]
+        askew = upright(se3.identity(), np.median(nodes[:, 2, :3], axis=0))
+        ups_base = (np.tile(T[2, :3], (len(nodes), 1)) for T in (askew, se3.identity()))
+        if not are_steady(nodes, *ups_base):
+            askew = se3.identity()
         T_map_node = self.T_map_node[self.nearest(T_map_base, piece)]
         node, base = (
             planar.from_transform(T @ se3.inverse(askew)) for T in (T_map_node, T_map_base)

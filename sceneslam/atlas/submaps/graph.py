@@ -25,7 +25,7 @@ _FIXED = np.repeat([1e-4, 1e-5], 3)  # m, rad
 _LOOSE = np.array([10.0, 10.0, 1.0, 0.05, 0.05, 3.0])  # m, rad: any loop moves it
 _FLOOR = np.array([0.05, 0.02, 0.02]) ** 2  # m, rad: height and tilt between places of one floor
 _TILT_RAD = 0.04  # that modules drift in pitch along a corridor, before gravity corrects them
-_UPRIGHT_RAD = 0.01  # half a degree: of gyro and gravity, and as floors are uneven
+UPRIGHT_RAD = 0.01  # half a degree: of gyro and gravity, and as floors are uneven
 _HUBER_SIGMAS = 1.345  # 95 % efficiency relative to least squares, without outliers
 _ROUNDS = 10  # in which the loops that fit worst are left out
 _STEPS, _GAIN_RATIO = 20, 1e-3  # of a solution while the run goes on: its cost falls no further
@@ -201,7 +201,7 @@ def _problem(
         values.insert(number, gtsam.Pose3(T))
     for edge in motions:
         graph.add(factor_of(edge))
-    tilt = gtsam.noiseModel.Isotropic.Sigma(2, _UPRIGHT_RAD)
+    tilt = gtsam.noiseModel.Isotropic.Sigma(2, UPRIGHT_RAD)
     for one in uprights:
         directions = gtsam.Unit3(one.up_map), tilt, gtsam.Unit3(one.up_node)
         graph.add(gtsam.AttitudeFactorPose3(one.node, *directions))

@@ -98,7 +98,7 @@ class RunGraph:
             start = self._T_map_node if used else np.array(chain.T_run_node)
             solved = Solved(T_map_node=start, accepted=[])
             if used:
-                ups = uprights(straightened(chain.submaps), start, range(len(chain)))
+                ups = uprights(straightened(chain), start, range(len(chain)))
                 solved = settle(start, chain.ties, used, ups)
             self._agreed, self._T_map_node = agreeing, solved.T_map_node
             self._accepted = [used[index] for index in solved.accepted]
@@ -135,7 +135,7 @@ class RunGraph:
         nodes = np.concatenate([self._loaded.T_map_node, ends.placed(fixes, T_map_node)])
         around = self._loaded.nodes() if places and self._moves_loaded else []
         moving = self._loaded.moving(around)
-        submaps = [*self._loaded.submaps, *straightened(chain.submaps)]
+        submaps = [*self._loaded.submaps, *straightened(chain)]
         solved = solve(
             nodes,
             [*moving.motions, *(edge.shifted(count) for edge in chain.ties), *own_loops],

@@ -8,24 +8,44 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.atlas.submaps.graph import Upright
+from sceneslam.atlas.submaps.chain import Chain
+from sceneslam.atlas.submaps.graph import UPRIGHT_RAD, Upright
 from sceneslam.atlas.submaps.submap import Submap
 from sceneslam.motion.tilt import upright
 from sceneslam.types import se3
 
 
-def straightened(submaps: Sequence[Submap]) -> list[Submap]:
+def straightened(chain: Chain) -> list[Submap]:
     """Return the submaps of a whole run, their vertical directions without its usual tilt.
 
     Base is level most of the time: a sensor that is mounted askew has the same tilt everywhere.
+    The tilt stays where it is that of base, as on a ramp.
     """
-    measured = [submap.up for submap in submaps if submap.up is not None]
-    if not measured:
-        return list(submaps)
-    askew = upright(se3.identity(), np.median(measured, axis=0))[:3, :3]
-    return [
-        submap if submap.up is None else replace(submap, up=askew @ submap.up) for submap in submaps
-    ]
+    submaps = list(chain.submaps)
+    known = [node for node, submap in enumerate(submaps) if submap.up is not None]
+    if not known:
+        return submaps
+    ups = np.array([submaps[node].up for node in known])
+    level = ups @ upright(se3.identity(), np.median(ups, axis=0))[:3, :3].T
+    if are_steady(np.array(chain.T_run_node)[known], level, ups):
+        for node, up in zip(known, level, strict=True):
+            submaps[node] = replace(submaps[node], up=up)
+    return submaps
+
+
+def are_steady(
+    T_map_node: NDArray[np.float64], ups: NDArray[np.float64], others: NDArray[np.float64]
+) -> bool:
+    """Tell whether directions (N, 3) in nodes (N, 4, 4) change in the map no more than others.
+
+    A direction that is not vertical turns with base. Changes are summed from each node to the
+    next, as modules drift in tilt over many.
+    """
+    changes, least = (
+        np.diff(np.einsum("nij,nj->ni", T_map_node[:, :3, :3], each), axis=0)
+        for each in (ups, others)
+    )
+    return bool((changes**2).sum() <= (least**2).sum() + UPRIGHT_RAD**2)
 
 
 def uprights(
