@@ -354,6 +354,26 @@ def test_image_that_cannot_be_used_is_named_and_the_run_goes_on(make, picture, e
     assert says in event["what"]
 
 
+def test_depth_of_another_size_than_the_image_is_named_once_and_left_out(make):
+    robot = Robot(*ALL)
+    of_own_topic = robot._message
+
+    def message(encoder, topic, stamp_ns):
+        if topic == DEPTH:
+            return encoder.image(stamp_ns, np.full((3, 4, 1), 2000, np.uint16), "16UC1")
+        return of_own_topic(encoder, topic, stamp_ns)
+
+    robot._message = message
+    source = make(robot)
+    heard(source, robot)
+    drive(robot, 4)
+    found = taken(source, 3)
+    assert all(one.image_bgr is not None and one.depth_m is None for one in found)
+    (event,), (fault,) = told(source, "left_out"), source.faults
+    assert event["what"] == "a depth image was left out, it has 4x3 pixels, not 8x6"
+    assert "3 times" in fault or "4 times" in fault
+
+
 def test_damaged_message_is_named_and_the_run_goes_on(make):
     robot = Robot(*ALL)
     source = make(robot)

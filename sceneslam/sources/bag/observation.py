@@ -39,7 +39,10 @@ class BundleDecoder:
         sensors: frozenset[Sensor],
         size_wh: tuple[int, int] | None,
         units: DepthUnits,
+        *,
+        is_live: bool = False,
     ) -> None:
+        self._is_live = is_live
         self._primary = primary
         self._sensors = sensors
         self._size_wh = size_wh
@@ -49,7 +52,7 @@ class BundleDecoder:
     def observe(self, bundle: SynchronisedSamples) -> Decoded:
         """Return the observation of the samples; an image of another size is treated as damaged.
 
-        Raises InputError where the first depth image has another size than the image.
+        Raises InputError where the first depth image has another size than the image, if not live.
         """
         problems: list[str] = []
         stamp_ns = bundle.primary.stamp_ns
@@ -103,7 +106,8 @@ class BundleDecoder:
             problems.append("a depth image could not be decoded")
             return None
         if not self._has_size("a depth image", depth_m, problems):
-            self._refuse_first(sample.stamp_ns, depth_m)
+            if not self._is_live:
+                self._refuse_first(sample.stamp_ns, depth_m)
             return None
         self._has_depth = True
         if decode.is_blank_depth(sample.value):

@@ -211,7 +211,8 @@ class Ros2(Measuring):
         size_wh = picture_size_wh(self.heard, self.topics) if is_seeing else None
         sensors = self._rig.sensors
         self._decoders = {
-            sensor: BundleDecoder(sensor, sensors, size_wh, units) for sensor in PRIMARY
+            sensor: BundleDecoder(sensor, sensors, size_wh, units, is_live=True)
+            for sensor in PRIMARY
         }
         self._streams = Streams(self._by_sensor, self._silent_after_s, monotonic_ns())
         for topic in sorted(used):
