@@ -396,6 +396,21 @@ def test_odometry_of_another_frame_is_brought_to_the_base(
 
 
 @pytest.mark.parametrize(
+    ("child", "unplaced"),
+    [("t265", ["t265"]), ("laser", []), ("base_footprint", []), ("husky/base_link", []), ("", [])],
+)
+def test_frame_of_odometry_that_no_transform_places_is_named(
+    tmp_path: Path, child: str, unplaced: list[str]
+) -> None:
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        tree = [transform(recorder, "base_link", "laser", 0.5)]
+        recorder.add("/tf_static", 0, recorder.new("tf2_msgs/msg/TFMessage", transforms=tree))
+        recorder.scan("/scan", STAMP_NS, [1.0, 2.0])
+        recorder.add("/odom", STAMP_NS, odometry(recorder, STAMP_NS, np.eye(4), child))
+    assert make_source("mcap", tmp_path / "a.mcap").survey().unplaced == unplaced
+
+
+@pytest.mark.parametrize(
     ("topic", "parent", "laser"),
     [
         ("/robot1/tf_static", "base_link", "laser"),

@@ -46,7 +46,7 @@ class FrameTree:
 
     def is_base(self, frame: str) -> bool:
         """Tell whether a frame is the base; without a base, whether it has a base's name."""
-        return frame == self.base or (self.base is None and _last_part(frame) in _BASES)
+        return frame == self.base or (self.base is None and has_base_name(frame))
 
     def T_base(self, frame: str) -> Transform | None:
         """Return T_base_frame (4, 4) [m]; None if no chain of transforms connects both."""
@@ -77,6 +77,11 @@ def is_of_transforms(topic: str) -> bool:
 def is_static(topic: str) -> bool:
     """Tell whether a topic's name, in any namespace, is that of transforms that do not change."""
     return _last_part(topic) == _last_part(names.TF_STATIC)
+
+
+def has_base_name(frame: str) -> bool:
+    """Tell whether a frame's name, in any namespace, is that of a base."""
+    return _last_part(frame) in _BASES
 
 
 def is_beside(topic: str, used: Collection[str]) -> bool:

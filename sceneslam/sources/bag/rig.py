@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from sceneslam.ros import decode, names, pixels
-from sceneslam.sources.bag.frames import FrameTree
+from sceneslam.sources.bag.frames import FrameTree, has_base_name
 from sceneslam.sources.bag.observation import Mounts
 from sceneslam.sources.bag.recording import Recording
 from sceneslam.sources.bag.topics import BagTopics, first, inertial_sensors, infos_of
@@ -85,10 +85,16 @@ def place(recording: Recording, topic: str, frames: FrameTree) -> Transform:
 
 
 def unplaced(recording: Recording, topics: BagTopics, frames: FrameTree) -> list[str]:
-    """Return the frames of sensors that no transform places; another sensor may place an IMU."""
+    """Return the frames of sensors that no transform places; another sensor may place an IMU.
+
+    The frame whose pose odometry reports is one of them, unless it has a base's name.
+    """
     imu = topics.imu if _T_base_imu(recording, topics, frames) is None else None
     chosen = (topics.image or topics.depth, topics.scan, topics.points, imu)
-    return unconnected(recording, [topic for topic in chosen if topic], frames)
+    found = unconnected(recording, [topic for topic in chosen if topic], frames)
+    child = _odometry_child(recording, topics)
+    is_placed = frames.is_base(child) or has_base_name(child) or frames.T_base(child) is not None
+    return found if not child or is_placed or child in found else [*found, child]
 
 
 def unconnected(recording: Recording, topics: Sequence[str], frames: FrameTree) -> list[str]:
@@ -126,8 +132,7 @@ def find_mounts(recording: Recording, topics: BagTopics, frames: FrameTree) -> M
         imu = first(recording, topics.imu) if topics.imu else None
         is_optical = imu is not None and decode.frame_id(imu).endswith("_optical_frame")
         T_base_imu = optical_to_rep103() if is_optical else se3.identity()
-    message = first(recording, topics.odometry) if topics.odometry else None
-    child = "" if message is None else decode.child_frame_id(message)
+    child = _odometry_child(recording, topics)
     T_base_child = frames.T_base(child) if child else None
     T_child_base = se3.identity() if T_base_child is None else se3.inverse(T_base_child)
     return Mounts(T_base_imu=T_base_imu, T_child_base=T_child_base)
@@ -146,6 +151,12 @@ def picture_size_wh(recording: Recording, topics: BagTopics) -> tuple[int, int]:
         if picture is not None:
             return int(picture.shape[1]), int(picture.shape[0])
     raise InputError(f"none of the images of {topic} can be decoded")
+
+
+def _odometry_child(recording: Recording, topics: BagTopics) -> str:
+    """Return the frame whose pose odometry reports, "" if it is not named."""
+    message = first(recording, topics.odometry) if topics.odometry else None
+    return "" if message is None else decode.child_frame_id(message)
 
 
 def _T_base_imu(recording: Recording, topics: BagTopics, frames: FrameTree) -> Transform | None:
