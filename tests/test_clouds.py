@@ -50,6 +50,26 @@ def test_depth_becomes_points_of_base():
         reader.read(Observation(stamp_ns=0, depth_m=np.zeros((4, 4), np.float32)))
 
 
+def test_depth_at_pixels_that_no_ray_of_a_folding_lens_reaches_is_missing():
+    camera = Camera(
+        size_wh=(640, 480),
+        fx=340.0,
+        fy=340.0,
+        cx=319.5,
+        cy=239.5,
+        distortion=(-0.33, 0.12, 0.0, 0.0, -0.02),
+    )
+    reader = CloudReader(
+        Rig(sensors=frozenset({Sensor.DEPTH}), camera=camera),
+        depth_range_max_m=5.0,
+        depth_stride_px=8,
+    )
+    wall_m = np.full((480, 640), 2.0, np.float32)
+    cloud = reader.read(Observation(stamp_ns=0, depth_m=wall_m))
+    assert 0.8 * 4800 < len(cloud) < 4800
+    assert np.abs(cloud[:, 1:]).max() < 3.0  # at most 1.3 m per metre
+
+
 def test_cloud_of_a_place_that_is_seen_again_does_not_grow():
     rng, cloud = np.random.default_rng(0), VoxelCloud(0.1)
     parts = [rng.uniform(0.0, 1.0, (30_000, 3)).astype(np.float32) for _ in range(40)]

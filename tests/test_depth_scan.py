@@ -159,6 +159,20 @@ def test_lens_distortion_is_taken_out():
     assert 0.002 < abs(ends[0] - ends[1]) < 0.05
 
 
+def test_pixels_that_no_ray_of_a_folding_lens_reaches_have_no_beam():
+    camera = Camera(
+        size_wh=(640, 480),
+        fx=300.0,
+        fy=300.0,
+        cx=319.5,
+        cy=239.5,
+        distortion=(-0.33, 0.12, 0.0, 0.0, -0.02),
+        depth_range_m=(0.4, 6.0),
+    )
+    scan = scan_from_depth(np.full((480, 640), 2.0, np.float32), camera, stamp_ns=0)
+    assert 0.8 < np.abs(scan.angles_rad).max() < 1.0
+
+
 def test_camera_that_looks_straight_down_has_a_frame():
     camera = camera_at(height_m=1.0, tilt_rad=np.pi / 2)
     assert abs(se3.yaw_rad(scan_frame(camera))) < 1e-6

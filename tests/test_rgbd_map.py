@@ -16,7 +16,7 @@ from sceneslam.modules.slam.rgbd.map.landmarks import LandmarkTable, Looks
 from sceneslam.modules.slam.rgbd.map.layers import LayerBuilder
 from sceneslam.modules.slam.rgbd.see.alignment import Alignment
 from sceneslam.modules.slam.rgbd.see.features import FeatureExtractor
-from sceneslam.modules.slam.rgbd.see.lens import undistorted
+from sceneslam.modules.slam.rgbd.see.lens import undistorted, undistorted_bounds
 from sceneslam.types import se3
 from sceneslam.types.rig import Camera
 
@@ -251,6 +251,27 @@ def test_points_of_a_camera_with_distortion_lie_on_the_walls():
     assert len(points) > 4000
     beyond_m = (points @ np.array([[0.7, 0.7, 0.0], [0.7, -0.7, 0.2]]).T).max(axis=1) - 2.0
     assert np.abs(beyond_m).max() < 0.003
+
+
+FOLDED = replace(CAMERA, fx=340.0, fy=340.0, distortion=(-0.33, 0.12, 0.0, 0.0, -0.02))
+
+
+def test_pixels_that_no_ray_of_a_folding_lens_reaches_are_missing():
+    """This lens shows nothing farther than 330 px from the centre of its image."""
+    layers = LayerBuilder(FOLDED, cloud_stride_px=8, cloud_voxel_m=0.03, grid_resolution_m=0.05)
+    wall_m, image_bgr = np.full((480, 640), 2.0, np.float32), np.zeros((480, 640, 3), np.uint8)
+    points = layers.view(wall_m, image_bgr, stamp_ns=0).points_base
+    assert 0.8 * 4800 < len(points) < 4800
+    assert np.abs(points[:, 1:]).max() < 3.0
+    extractor = FeatureExtractor(
+        FOLDED, Alignment(), count=500, fast_threshold_min=7, fast_noise_ratio=4.0
+    )
+    features = extractor.extract(patchwork(np.random.default_rng(0)), wall_m)
+    assert 300 < len(features) < 500
+    assert len(features.descriptors) == len(features.levels) == len(features.depth_m)
+    least_px, most_px = undistorted_bounds(FOLDED)
+    assert (np.abs([least_px[0], most_px[0] - 640]) < 150).all() and (least_px < -40).all()
+    assert (features.uv_px > least_px - 50).all() and (features.uv_px < most_px + 50).all()
 
 
 def test_surfaces_agree_from_another_pose_of_a_camera_with_distortion(monkeypatch):

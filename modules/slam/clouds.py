@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.types import se3
 from sceneslam.types.errors import InputError
+from sceneslam.types.lens import undistorted_rays
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Camera, Rig, Sensor
 
@@ -96,10 +96,13 @@ def _moved(points: Cloud, times_s: NDArray[np.float64], twist_s: NDArray[np.floa
 
 
 def _rays_cam(camera: Camera, stride_px: int) -> Cloud:
-    """Return the rays (N, 3), z = 1, cam, of every stride-th pixel, without distortion."""
+    """Return the rays (N, 3), z = 1, cam, of every stride-th pixel, without distortion.
+
+    All NaN for pixels without a ray, so that their depth is missing.
+    """
     width, height = camera.size_wh
     start = stride_px // 2
     u, v = np.meshgrid(np.arange(start, width, stride_px), np.arange(start, height, stride_px))
     pixels = np.stack([u.ravel(), v.ravel()], axis=-1).astype(np.float64)
-    xy = cv2.undistortPoints(pixels[:, None], camera.K, np.array(camera.distortion)).reshape(-1, 2)
-    return np.column_stack([xy, np.ones(len(xy))])
+    xy = undistorted_rays(camera, pixels)
+    return np.column_stack([xy, np.where(np.isnan(xy[:, 0]), np.nan, 1.0)])

@@ -7,13 +7,13 @@ depend on its depth, and a scan needs three look-ups in tables that are computed
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.scans.band import checked_band
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
+from sceneslam.types.lens import undistorted_rays
 from sceneslam.types.observation import LaserScan
 from sceneslam.types.rig import Camera
 
@@ -160,8 +160,7 @@ def _rays_cam(camera: Camera, stride_px: int) -> NDArray[np.float64]:
     rays = np.ones((u.size, 3))
     if any(camera.distortion):
         pixels = np.stack([u.ravel(), v.ravel()], axis=-1).astype(np.float64)
-        distortion = np.array(camera.distortion)
-        rays[:, :2] = cv2.undistortPoints(pixels[:, None], camera.K, distortion).reshape(-1, 2)
+        rays[:, :2] = undistorted_rays(camera, pixels)  # NaN: it does not cross the band
     else:
         rays[:, 0] = (u.ravel() - camera.cx) * (1.0 / camera.fx)
         rays[:, 1] = (v.ravel() - camera.cy) * (1.0 / camera.fy)

@@ -43,6 +43,7 @@ class LayerBuilder:
         v, u = (axis[self._sampled] for axis in np.mgrid[:height, :width].astype(np.float64))
         uv_image = np.stack([u, v], axis=-1)
         self._uv_px = undistorted(camera, uv_image.reshape(-1, 2)).reshape(uv_image.shape)
+        self._has_ray = np.isfinite(self._uv_px).all(axis=-1)
         self._scanner = _make_scanner(camera)
 
     def view(
@@ -52,7 +53,7 @@ class LayerBuilder:
         if depth_m is None:
             return nothing_seen()
         camera, depth = self._camera, depth_m[self._sampled]
-        row, column = np.nonzero(camera.measures(depth))
+        row, column = np.nonzero(camera.measures(depth) & self._has_ray)
         z = depth[row, column]
         u, v = self._uv_px[row, column].T
         x, y = (u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z

@@ -59,11 +59,13 @@ class FeatureExtractor:
         """Return the features of `gray` (H, W); without a depth image all depths are missing."""
         corners = self._corners.find(gray)
         uv_px = undistorted(self._camera, corners.uv_px)
-        depths_m, slopes = self._depths(self._in_depth(corners.uv_px, uv_px, depth_m), depth_m)
+        rows = np.flatnonzero(np.isfinite(uv_px).all(axis=1))
+        uv_image, uv_px = corners.uv_px.take(rows, axis=0), uv_px.take(rows, axis=0)
+        depths_m, slopes = self._depths(self._in_depth(uv_image, uv_px, depth_m), depth_m)
         return Features(
             uv_px=uv_px,
-            levels=corners.levels,
-            descriptors=corners.descriptors,
+            levels=corners.levels.take(rows),
+            descriptors=corners.descriptors.take(rows, axis=0),
             depth_m=depths_m,
             depth_slope_m_per_px=slopes,
         )

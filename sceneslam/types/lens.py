@@ -1,0 +1,29 @@
+"""Rays of a camera's pixels, without lens distortion."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.types.rig import Camera
+
+_SAME_PX = 1.0  # a ray's own pixel is nearer than this
+
+
+def undistorted_rays(camera: Camera, uv_px: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the rays (N, 2), x / z and y / z in cam, of the pixels (N, 2) of an image.
+
+    A ray is NaN where the distortion does not show it at its pixel again: OpenCV's iteration does
+    not converge where a lens model folds or bends too much, and does not say so.
+    """
+    if not len(uv_px):
+        return np.zeros((0, 2))
+    distortion = np.array(camera.distortion)
+    rays = np.asarray(cv2.undistortPoints(uv_px[:, None], camera.K, distortion)[:, 0], np.float64)
+    if distortion.any():
+        points_cam, still = np.column_stack([rays, np.ones(len(rays))]), np.zeros(3)
+        again_px = cv2.projectPoints(points_cam, still, still, camera.K, distortion)[0][:, 0]
+        off_px = np.linalg.norm(again_px - uv_px, axis=1)
+        rays[~(off_px < _SAME_PX)] = np.nan
+    return rays
