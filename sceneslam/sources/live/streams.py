@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import threading
-from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections import Counter, deque
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import pairwise
+from statistics import median
 
 from sceneslam.sources.bag.observation import PRIMARY
 from sceneslam.sources.live.clock import Lined, StampOrder
@@ -13,7 +15,10 @@ from sceneslam.types.run import Event
 
 _WAITED_FOR = frozenset({Sensor.DEPTH, Sensor.ODOMETRY, Sensor.GYRO, Sensor.ACCELEROMETER})
 _STREAK_NS = 5_000_000_000  # a lasting condition is reported at this interval
-_FOLLOWED_NS = 300_000_000  # a silent publisher has left: three periods at 10 Hz
+_FOLLOWED_NS = 300_000_000  # a publisher that is silent for so long has left, ...
+_FOLLOWED_PERIODS = 3  # ... and for so many of its periods
+_UNKNOWN = 0  # the publisher, if the transport does not tell it
+_ARRIVALS = 6  # from which a publisher's period is measured
 
 
 class Streams:
@@ -26,7 +31,8 @@ class Streams:
         self._silent: set[str] = set()
         self._first_ns: dict[str, int] = {}
         self._told_ns: dict[tuple[str, str], int] = {}
-        self._publishers: dict[str, tuple[int, int]] = {}  # topic -> publisher, last arrival
+        self._followed: dict[str, int] = {}  # topic -> used publisher
+        self._arrivals_ns: dict[tuple[str, int], deque[int]] = {}  # of a topic and publisher
         self._shifts_ns: dict[str, int] = {}
         self._dropped: Counter[str] = Counter()
         self._dropped_ns = now_ns
@@ -68,12 +74,27 @@ class Streams:
 
         With two publishers, the first is used until it is silent.
         """
-        followed, heard_ns = self._publishers.get(topic, (publisher, arrived_ns))
-        if publisher != followed and arrived_ns - heard_ns < _FOLLOWED_NS:
+        arrivals_ns = self._arrivals_ns.setdefault((topic, publisher), deque(maxlen=_ARRIVALS))
+        arrivals_ns.append(arrived_ns)
+        followed = self._followed.setdefault(topic, publisher)
+        if publisher == followed:
+            return True
+        followed_ns = self._arrivals_ns[topic, followed]
+        if arrived_ns - followed_ns[-1] < self._patience_ns(followed_ns):
             self.tell_once("second_publisher", stamp_ns, arrived_ns, topic=topic)
             return False
-        self._publishers[topic] = publisher, arrived_ns
+        self._followed[topic] = publisher
+        self.tell_once("publisher_changed", stamp_ns, arrived_ns, topic=topic)
         return True
+
+    def count_publishers(self, topics: Iterable[str], stamp_ns: int, now_ns: int) -> None:
+        """Report two publishers of a topic whose messages do not say who sent them.
+
+        `topics` has the topic of each publisher.
+        """
+        for topic, count in Counter(topics).items():
+            if count > 1 and self._followed.get(topic) == _UNKNOWN:
+                self.tell_once("second_publisher", stamp_ns, now_ns, topic=topic)
 
     def hear(self, topic: str, lined: Lined, arrived_ns: int) -> None:
         """Record the arrival of a message."""
@@ -117,6 +138,13 @@ class Streams:
             for topic, count in sorted(self._dropped.items()):
                 self.tell("messages_dropped", stamp_ns, topic=topic, count=count)
             self._dropped.clear()
+
+    def _patience_ns(self, arrivals_ns: Sequence[int]) -> float:
+        """Return how long a publisher has to be silent until another one is used."""
+        if len(arrivals_ns) < 2:
+            return max(_FOLLOWED_NS, self._silent_ns)
+        period_ns = median(later - earlier for earlier, later in pairwise(arrivals_ns))
+        return max(_FOLLOWED_NS, _FOLLOWED_PERIODS * period_ns)
 
     def notices(self) -> Sequence[Event]:
         """Return the events since the last call."""

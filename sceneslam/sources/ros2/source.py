@@ -242,6 +242,7 @@ class Ros2(Measuring):
             patience_s=_PATIENCE_S,
             extrapolates=True,
         )
+        types = {topic: self.heard.topics[topic].msgtype for topic in self._by_sensor.values()}
         stamp_ns = asked_ns = 0
         looked_ns = monotonic_ns()
         while not self._inbox.is_closed:
@@ -259,7 +260,10 @@ class Ros2(Measuring):
                 streams.drop(self._inbox.take_dropped(), looked_ns, stamp_ns)
             if now_ns - asked_ns > _NETWORK_S * 1e9 and self._transport is not None:
                 asked_ns, self._stamp_ns = now_ns, stamp_ns
-                self._network_watch.look(self._transport.publications())
+                published = self._transport.publications()
+                self._network_watch.look(published)
+                alike = [one.topic for one in published if one.msgtype == types.get(one.topic)]
+                streams.count_publishers(alike, stamp_ns, now_ns)
             primary = streams.pace
             synchroniser.follow(primary, streams.waits_for)
 
