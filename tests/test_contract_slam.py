@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from hydra.utils import instantiate
 from isolation import isolating
 from omegaconf import OmegaConf
 
+from sceneslam.modules.slam.odometry import Odometry
 from sceneslam.testing import MODULE_CHECKS, ContractError, check_module, room_observation
 from sceneslam.types.trajectory import Trajectory
 
@@ -78,3 +80,39 @@ def test_module_keeps_its_contract(make, check, request):
 def test_a_module_that_does_not_follow_is_found():
     with pytest.raises(ContractError, match=r"within 0\.05 m"):
         check_module(ExactModule)  # it knows the motion of another drive
+
+
+@pytest.mark.parametrize(
+    ("wrong", "complaint"),
+    [
+        ({"quality_ratio": float("nan")}, "quality_ratio: expected 0 to 1"),
+        ({"revision": 1.0}, "revision: expected int, got float"),
+        ({"map_covariance": -np.eye(6)}, "map_covariance: expected finite numbers"),
+    ],
+)
+def test_what_the_bus_refuses_is_found(wrong, complaint):
+    class Wrong(Odometry):
+        def track(self, observation):
+            return replace(super().track(observation), **wrong)
+
+    with pytest.raises(ContractError, match=complaint):
+        check_module(Wrong)
+
+
+def test_a_trajectory_that_the_bus_refuses_is_found():
+    class Nothing(Odometry):
+        def get_trajectory(self):
+            return None
+
+    with pytest.raises(ContractError, match="get_trajectory's answer: expected Trajectory"):
+        check_module(Nothing)
+
+
+def test_numbers_of_numpy_are_accepted():
+    class Numpys(Odometry):
+        def track(self, observation):
+            return replace(
+                super().track(observation), revision=np.int64(0), can_begin=np.bool_(False)
+            )
+
+    check_module(Numpys)

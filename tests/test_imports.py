@@ -21,11 +21,11 @@ ALLOWED = {  # package -> what of ours it may import
     "sceneslam/views": {"types", "views"},
     "sceneslam/graphs": {"types", "graphs"},
     "sceneslam/maps": {"types", "scans", "graphs", "atlas", "storage", "streams", "maps"},
-    "sceneslam/testing": {"types", "interfaces", "testing"},
+    "sceneslam/testing": {"types", "interfaces", "answers", "testing"},
     "sceneslam/supervision": {"types", "interfaces", "supervision"},
     "sceneslam/storage": {"types", "interfaces", "storage"},
     "sceneslam/engine": {"types", "interfaces", "engine"},
-    "sceneslam/bus": {"types", "interfaces", "motion", "executors", "storage", "bus"},
+    "sceneslam/bus": {"types", "interfaces", "answers", "motion", "executors", "storage", "bus"},
     "sceneslam/evaluation": {"types", "interfaces", "evaluation"},
     "sceneslam/scenes": {"types", "interfaces", "config", "evaluation", "scenes"},
     "sceneslam/detection": {

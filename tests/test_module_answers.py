@@ -10,7 +10,7 @@ from fakes import ExactModule, observation
 
 from sceneslam.atlas.fusion import Placed, fuse
 from sceneslam.atlas.save import save_points
-from sceneslam.bus.judging.answers import checked_layers, checked_tracking, checked_trajectory
+from sceneslam.answers import checked_layers, checked_tracking, checked_trajectory
 from sceneslam.storage.journal import Journal, JournalHeader, read_journal
 from sceneslam.types import se3
 from sceneslam.types.maps import (

@@ -18,7 +18,7 @@ from fakes import RIG, ExactModule, observation, true_pose
 from isolation import limits
 from test_module_answers import LAYERS
 
-from sceneslam.bus.judging.answers import checked_layers
+from sceneslam.answers import checked_layers
 from sceneslam.config.check import check_node
 from sceneslam.experiments.programs.case import run_case
 from sceneslam.experiments.programs.hostile import KINDS, plan

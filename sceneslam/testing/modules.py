@@ -8,8 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from sceneslam.answers import checked_layers, checked_tracking, checked_trajectory
 from sceneslam.interfaces import SlamModule
-from sceneslam.testing.promise import expect
+from sceneslam.testing.promise import accepted, expect
 from sceneslam.testing.room import RIG, room_observation
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
@@ -70,6 +71,7 @@ def answers_with_rigid_poses_at_the_stamp(make: Make) -> None:
     """Check that poses are float64 and rigid, and covariances not negative."""
     with _active(make) as module:
         for index, tracking in enumerate(_drive(module)):
+            accepted(checked_tracking, tracking, room_observation(index).stamp_ns)
             T, stamp_ns = tracking.T_local_base, room_observation(index).stamp_ns
             expect(tracking.stamp_ns == stamp_ns, f"stamp_ns {stamp_ns}", tracking.stamp_ns)
             expect(T.dtype == np.float64 and T.shape == (4, 4), "T_local_base: (4, 4) float64", T)
@@ -131,7 +133,9 @@ def maps_in_local(make: Make) -> None:
     """Check that points and grid are finite float32 and within the room."""
     with _active(make) as module:
         _drive(module)
+        accepted(checked_trajectory, module.get_trajectory())
         layers = module.get_map()
+        accepted(checked_layers, layers)
         if layers.points is not None:
             points = layers.points.points
             is_cloud = points.dtype == np.float32 and points.shape[1:] == (3,)

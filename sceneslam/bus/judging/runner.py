@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from time import perf_counter_ns
 
-from sceneslam.bus.judging.answers import checked_layers, checked_tracking, checked_trajectory
+from sceneslam.answers import checked_layers, checked_tracking, checked_trajectory
 from sceneslam.interfaces import Concurrent, Restartable, SlamModule
 from sceneslam.types.errors import ModuleError, calling
 from sceneslam.types.maps import MapLayers

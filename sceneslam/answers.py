@@ -45,8 +45,8 @@ def checked_tracking(tracking: object, stamp_ns: int) -> Tracking:
     """Return the module's answer to the observation at `stamp_ns`, with copies of its arrays."""
     tracking = _of("track's answer", tracking, Tracking)
     _of("status", tracking.status, TrackingStatus)
-    _of("revision", tracking.revision, int)
-    _of("can_begin", tracking.can_begin, bool)
+    _of("revision", tracking.revision, (int, np.integer))
+    _of("can_begin", tracking.can_begin, (bool, np.bool_))
     if tracking.stamp_ns != stamp_ns:
         raise ValueError(f"stamp_ns: expected {stamp_ns}, got {tracking.stamp_ns}")
     if not 0.0 <= tracking.quality_ratio <= 1.0:
@@ -60,6 +60,8 @@ def checked_tracking(tracking: object, stamp_ns: int) -> Tracking:
     return replace(
         tracking,
         T_local_base=T_local_base,
+        revision=int(tracking.revision),
+        can_begin=bool(tracking.can_begin),
         covariance=_covariance("covariance", tracking.covariance),
         map_covariance=_covariance("map_covariance", tracking.map_covariance),
     )
@@ -138,9 +140,10 @@ def _check_colors(colors_bgr: NDArray[Any]) -> None:
         raise ValueError(f"points.colors_bgr: expected 0 to 255, got {kind}: {low} to {high}")
 
 
-def _of(name: str, value: object, kind: type[Value]) -> Value:
+def _of(name: str, value: object, kind: type[Value] | tuple[type[Value], ...]) -> Value:
     if not isinstance(value, kind):
-        raise TypeError(f"{name}: expected {kind.__name__}, got {type(value).__name__}")
+        expected = kind[0] if isinstance(kind, tuple) else kind
+        raise TypeError(f"{name}: expected {expected.__name__}, got {type(value).__name__}")
     return value
 
 
