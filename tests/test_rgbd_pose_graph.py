@@ -99,6 +99,15 @@ def test_keyframes_stay_connected_when_those_between_them_are_forgotten():
     assert graph.way(0, 8).sigma_rad == pytest.approx(before.sigma_rad)
 
 
+def test_removed_keyframe_of_a_loop_leaves_motions_and_one_loop():
+    graph = chain(6)
+    graph.connect(edge(0, 4, se3.from_xy_yaw(4.0, 0.0, 0.0), sigma=0.001, is_loop=True))
+    assert graph.remove(4).first == 5
+    kinds = {(e.first, e.second): e.is_loop for e in graph.edges}
+    motions = dict.fromkeys([(0, 1), (1, 2), (2, 3), (3, 5)], False)
+    assert kinds == motions | {(0, 5): True}
+
+
 def test_graph_does_not_grow_when_every_new_keyframe_drives_out_an_old_one():
     graph, step = chain(30), se3.from_xy_yaw(1.0, 0.0, 0.0)
     for keyframe_id in range(30, 200):

@@ -61,6 +61,7 @@ class PoseGraph:
     def remove(self, keyframe_id: int) -> Edge | None:
         """Remove a keyframe; its most certain neighbour takes over the other edges.
 
+        A neighbour by a loop does so only without others, as all these edges would become loops.
         Returns the edge from that neighbour to the keyframe, None without neighbours.
         """
         near = self._edges.pop(keyframe_id)
@@ -68,7 +69,7 @@ class PoseGraph:
             del self._edges[other][keyframe_id]
         if not near:
             return None
-        heir = min(near.values(), key=lambda edge: float(np.trace(edge.covariance)))
+        heir = min(near.values(), key=lambda e: (e.is_loop, float(np.trace(e.covariance))))
         to_gone = heir.turned()
         for other, edge in near.items():
             if other != heir.second and other not in self._edges[heir.second]:
