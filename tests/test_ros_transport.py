@@ -116,6 +116,24 @@ def test_callback_that_fails_is_logged_and_the_next_message_comes(caplog):
         assert "a message of /scan could not be processed: ValueError: of no use" in caplog.text
 
 
+def test_samples_that_come_while_one_is_processed_are_kept():
+    with two_participants() as (sender, receiver):
+        inbox, is_free = Inbox(), threading.Event()
+
+        def heard(arrival):
+            inbox(arrival)
+            is_free.wait(WITHIN_S)
+
+        receiver.subscribe("/imu", STRING, heard, Qos.SAMPLES)
+        publisher = sender.publisher("/imu", STRING)
+        until(lambda: publisher.publish(CDR) or inbox.arrivals)
+        before = len(inbox.arrivals)
+        for _ in range(100):
+            publisher.publish(CDR)
+        is_free.set()
+        inbox.wait(before + 100)
+
+
 def test_nothing_is_left_of_a_transport_that_was_closed():
     before = threading.active_count()
     with two_participants() as (sender, receiver):

@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 
 from sceneslam.ros import names
 from sceneslam.ros.encode import Encoder
-from sceneslam.ros.transport.transport import Arrival, Publication
+from sceneslam.ros.transport.transport import Arrival, Publication, Qos
 from sceneslam.sources.ros2 import source as under_test
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError, InputError
@@ -46,6 +46,7 @@ class Robot:
 
     def __init__(self, *topics):
         self.encoder, self._heard, self.is_closed = Encoder(), {}, False
+        self.qos = {}
         self.mounts = {names.LASER: T_BASE_LASER, names.CAMERA: se3.identity()}
         self._topics = {topic: TYPES[topic] for topic in topics}
         for topic in topics:  # what serialises a type is made at its first message
@@ -59,7 +60,7 @@ class Robot:
 
     def subscribe(self, topic, msgtype, heard, qos=None):
         assert TYPES[topic] == msgtype
-        self._heard[topic] = heard
+        self._heard[topic], self.qos[topic] = heard, qos
 
     def unsubscribe(self, topic):
         self._heard.pop(topic, None)
@@ -165,6 +166,12 @@ def test_rig_is_what_is_heard(make):
     }  # fmt: skip
     assert rig.camera.size_wh == (8, 6)
     np.testing.assert_allclose(rig.laser.T_base_laser, T_BASE_LASER)
+
+
+def test_many_messages_are_kept_of_topics_with_samples_alone(make):
+    robot = Robot(*ALL)
+    heard(make(robot), robot)
+    assert {topic for topic, qos in robot.qos.items() if qos is Qos.SAMPLES} == {"/imu", "/odom"}
 
 
 def test_first_observation_is_one_that_every_stream_was_there_for(make):

@@ -39,6 +39,7 @@ from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
 from sceneslam.ros.transport.transport import (
+    BEST_EFFORT,
     DEPTHS,
     LOCALHOST,
     Arrival,
@@ -284,7 +285,7 @@ def _named(typename: str) -> Any:
 def _qos(qos: Qos) -> Any:
     policies = [
         Policy.Reliability.BestEffort
-        if qos is Qos.SENSOR
+        if qos in BEST_EFFORT
         else Policy.Reliability.Reliable(duration(milliseconds=100)),
         Policy.History.KeepLast(DEPTHS[qos]),
         Policy.Durability.TransientLocal

@@ -18,6 +18,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from sceneslam.ros.transport.transport import (
+    BEST_EFFORT,
     DEPTHS,
     LOCALHOST,
     Arrival,
@@ -148,7 +149,7 @@ def _profile(qos: Qos) -> QoSProfile:
     return QoSProfile(
         depth=DEPTHS[qos],
         reliability=ReliabilityPolicy.BEST_EFFORT
-        if qos is Qos.SENSOR
+        if qos in BEST_EFFORT
         else ReliabilityPolicy.RELIABLE,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if is_kept else DurabilityPolicy.VOLATILE,
     )

@@ -19,12 +19,20 @@ class Qos(Enum):
     """Quality of service profiles, named as in ROS 2."""
 
     SENSOR = "sensor data: best effort, the last few"
+    SAMPLES = "the same of an IMU or of odometry: the last second or more"
     RELIABLE = "reliable, the last ten"
     LATCHED = "reliable and transient local: who comes later gets the last one"
     HISTORY = "reliable and transient local, a hundred: as /tf_static is sent by several"
 
 
-DEPTHS = {Qos.SENSOR: 5, Qos.RELIABLE: 10, Qos.LATCHED: 1, Qos.HISTORY: 100}  # messages kept
+DEPTHS = {  # messages kept
+    Qos.SENSOR: 5,
+    Qos.SAMPLES: 500,
+    Qos.RELIABLE: 10,
+    Qos.LATCHED: 1,
+    Qos.HISTORY: 100,
+}
+BEST_EFFORT = (Qos.SENSOR, Qos.SAMPLES)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -9,7 +9,7 @@ from typing import Any
 from sceneslam.ros import decode, names
 from sceneslam.ros.messages import MessageDecoder, TopicType
 from sceneslam.ros.pixels import DepthUnits
-from sceneslam.ros.transport.transport import Arrival, Network, Transport, open_transport
+from sceneslam.ros.transport.transport import Arrival, Network, Qos, Transport, open_transport
 from sceneslam.sources.bag.frames import FrameTree, is_beside, is_static
 from sceneslam.sources.bag.observation import PRIMARY, BundleDecoder, measured
 from sceneslam.sources.bag.rig import (
@@ -215,8 +215,14 @@ class Ros2(Measuring):
             for sensor in PRIMARY
         }
         self._streams = Streams(self._by_sensor, self._silent_after_s, monotonic_ns())
+        sampled = {
+            topic
+            for sensor, topic in self._by_sensor.items()
+            if sensor.is_sampled or sensor is Sensor.ODOMETRY
+        }
         for topic in sorted(used):
-            transport.subscribe(topic, types[topic], self._inbox.put)
+            qos = Qos.SAMPLES if topic in sampled else Qos.SENSOR
+            transport.subscribe(topic, types[topic], self._inbox.put, qos)
         fixed = {topic for topic in self.heard.topics if is_static(topic)}
         mounts = {names.TF_STATIC, *(topic for topic in fixed if is_beside(topic, used))}
         followed = [topic for topic in (self.topics.camera_info, *sorted(mounts)) if topic]
