@@ -58,7 +58,7 @@ class SoftwareCamera:
     def is_emitting(self):
         return self._parts["depth"].get_option(rs.option.emitter_enabled) == 1.0
 
-    def measure(self, stamp_ns, *, has_depth=True):
+    def measure(self, stamp_ns, *, has_depth=True, has_image=True):
         """Send what it sees and feels at one instant: level, turning left at 0.5 rad/s."""
         for stream, vector in (
             (rs.stream.gyro, (0.0, -0.5, 0.0)),
@@ -73,7 +73,8 @@ class SoftwareCamera:
             depth = np.full((H, W), 2000, np.uint16)
             depth[:, : W // 2] = 9000  # beyond the range
             self._send("depth", self._depth, depth, 2, stamp_ns)
-        self._send("color", self._color, np.full((H, W, 3), 7, np.uint8), 3, stamp_ns)
+        if has_image:
+            self._send("color", self._color, np.full((H, W, 3), 7, np.uint8), 3, stamp_ns)
 
     def _video(self, part, kind, form, size, rate_hz):
         stream = rs.video_stream()
@@ -196,6 +197,32 @@ def test_camera_that_falls_silent_is_named_and_opened_again(make):
     events = [(one["event"], one["topic"]) for one in source.notices()]
     assert ("stream_silent", "image") in events
     assert len(opened) > 1
+
+
+def test_camera_whose_images_stall_while_its_imu_goes_on_is_opened_again(make):
+    camera, is_reopened = SoftwareCamera(), threading.Event()
+    source = make(camera, silent_after_s=0.2)
+    _ = source.rig
+    source_open = source._opener
+
+    def reopen(serial, wanted):
+        is_reopened.set()
+        return source_open(serial, wanted)
+
+    def talk():
+        for index in range(300):
+            camera.measure(10**12 + index * 10 * MS, has_depth=False, has_image=False)
+            if is_reopened.wait(0.01):
+                break
+        source.close()
+
+    source._opener = reopen
+    thread = threading.Thread(target=talk)
+    observations = iter(source)
+    thread.start()
+    assert next(observations, None) is None
+    thread.join()
+    assert is_reopened.is_set()
 
 
 def test_size_that_the_camera_lacks_is_named_with_what_it_has(make):

@@ -28,8 +28,8 @@ _TICK_S = 0.1  # interval of checks for silent streams
 class RealSense(Measuring):
     """Gives one observation per colour image, with the depth of the same instant.
 
-    A camera that falls silent or is unplugged is reopened as soon as it is available. `mount` is
-    its pose in `base`: `xyz_m`, and `rpy_rad`, zero for a camera that looks along x of `base`.
+    A camera that gives no images, or is unplugged, is reopened as soon as it is available. `mount`
+    is its pose in `base`: `xyz_m`, and `rpy_rad`, zero for a camera that looks along x of `base`.
     """
 
     def __init__(
@@ -92,13 +92,14 @@ class RealSense(Measuring):
         assert device is not None, "rig opened it"
         pairing = Pairing(self._tolerance_ns)
         device.start(self._waiting.put)
-        stamp_ns, heard_ns = 0, monotonic_ns()
+        stamp_ns, seen_ns = 0, monotonic_ns()
         while not self._waiting.is_closed:
             frame = self._waiting.take(_TICK_S)
             if frame is not None:
-                heard_ns = frame.arrived_ns
-                lined = self._clock.line_up(frame.sensor.value, frame.stamp_ns, heard_ns)
-                streams.hear(frame.sensor.value, lined, heard_ns)
+                if frame.sensor is Sensor.IMAGE:
+                    seen_ns = frame.arrived_ns
+                lined = self._clock.line_up(frame.topic, frame.stamp_ns, frame.arrived_ns)
+                streams.hear(frame.topic, lined, frame.arrived_ns)
                 if lined.order is not StampOrder.UNORDERED:
                     stamp_ns = lined.stamp_ns
                     pairing.add(frame, stamp_ns)
@@ -108,8 +109,8 @@ class RealSense(Measuring):
                 yield self._observation(paired, device)
             streams.look(now_ns, stamp_ns)
             streams.drop(self._waiting.take_dropped(), now_ns, stamp_ns)
-            if now_ns - heard_ns > self._silent_after_s * 1e9 and not self._waiting.is_closed:
-                heard_ns = now_ns
+            if now_ns - seen_ns > self._silent_after_s * 1e9 and not self._waiting.is_closed:
+                seen_ns = now_ns
                 device = self._device = self._reopened(device)
 
     def _reopened(self, device: OpenCamera) -> OpenCamera:
