@@ -113,12 +113,13 @@ class MapHistory:
     def step(self) -> Transform | None:
         """Do one image's share of loop closing; return T_new_old of the current pose, if moved."""
         corrections = self._closer.step()
-        if corrections:
-            self.revision += 1
-            self.segments.update()
-            return corrections.get(self.reference, se3.identity())
         if self._closer.is_solving:
             return None
+        if self.segments.are_many:  # a loop may have joined some, even where it moved nothing
+            self.segments.update()
+        if corrections:
+            self.revision += 1
+            return corrections.get(self.reference, se3.identity())
         return self._straighten(self._eye.shutter.step_s())
 
     def trajectory(self) -> Trajectory:

@@ -39,7 +39,7 @@ class Segments:
             self._guesses[heir] = se3.carried(guess, T_heir_gone)
 
     def update(self) -> None:
-        """Update after a correction, which may have joined segments."""
+        """Update after loops, which may have joined segments."""
         first = self._graph.connected(self._graph.ids[0])
         self._guesses = {k: guess for k, guess in self._guesses.items() if k not in first}
 

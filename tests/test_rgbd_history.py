@@ -1,0 +1,52 @@
+"""The rgbd map's history: which keyframes are connected, and how certain their edges are."""
+
+import numpy as np
+import pytest
+from rgbd_features import empty_map
+from test_rgbd_map import CAMERA, keyframe_at
+
+from sceneslam.graphs.edge import Edge, EdgeKind
+from sceneslam.modules.slam.rgbd.locate.localizer import VisualLocalizer
+from sceneslam.modules.slam.rgbd.locate.pose_solver import PoseSolver
+from sceneslam.modules.slam.rgbd.loops.loop_detection import LoopClosure, LoopDetector
+from sceneslam.modules.slam.rgbd.map.map_history import MapHistory
+from sceneslam.modules.slam.rgbd.see.rectifying_extractor import RectifyingExtractor
+from sceneslam.types import se3
+
+
+@pytest.fixture
+def history():
+    visual_map = empty_map(CAMERA, keyframe_limit=99)
+    solver = PoseSolver(CAMERA, seed=0)
+    localizer = VisualLocalizer(visual_map, solver, radius_px=20.0, min_inliers=20)
+    eye = RectifyingExtractor(visual_map, localizer, None)
+    made = MapHistory(visual_map, localizer, eye, min_inliers=20, is_repeatable=True)
+    yield made
+    made.shutdown()
+
+
+def insert(history, x_m, *, guessed_s=None):
+    history._map.insert(keyframe_at(x_m), deep_rows=np.zeros(0, np.int64))
+    history.insert(None, None, guessed_s=guessed_s)
+
+
+def test_segment_that_a_loop_joins_where_it_is_needs_no_guess_any_more(history, monkeypatch):
+    insert(history, 0.0)
+    insert(history, 1.0, guessed_s=2.0)
+    edge = Edge(
+        first=0,
+        second=1,
+        T_first_second=se3.from_xy_yaw(1.0, 0.0, 0.0),
+        covariance=1e-4 * np.eye(6),
+        kind=EdgeKind.LOOP,
+    )
+    loop = LoopClosure(edge=edge, T_local_base=edge.T_first_second)
+    monkeypatch.setattr(
+        LoopDetector, "candidate", lambda _, query: 0 if query.keyframe_id else None
+    )
+    monkeypatch.setattr(LoopDetector, "check", lambda *_: [loop])
+    assert history.segments.are_many
+    for _ in range(3):  # the first keyframe is queried; the second one is, and is checked
+        assert history.step() is None
+    assert history.pose_graph().is_loop.tolist() == [True]
+    assert not history.segments.are_many
