@@ -4,11 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from driving import GATE, drive, events
-from fakes import PERIOD_NS, ExactModule, observation, true_pose
+from driving import GATE, TABLE, drive, events, policy
+from fakes import PERIOD_NS, RIG, ExactModule, ScriptedDetector, observation, true_pose
 from test_acquittal import OPTIONS, Uncertain, frozen
 
+from sceneslam.atlas.atlas import Atlas
+from sceneslam.bus.bus import Bus
 from sceneslam.bus.scene.scene_filter import WindowFilter
+from sceneslam.storage.events import EventLog
 from sceneslam.types import se3
 from sceneslam.types.observation import SceneVote, TrackingStatus
 
@@ -131,3 +134,37 @@ def test_acquitted_poses_do_not_carry_the_drift_of_before_the_module_was_placed(
     _, atlas, log, _ = drive({"bright": Drifting()}, feed=frozen(40), **OPTIONS)
     assert events(log, "suspect")
     assert atlas._path.of_maps()[:, 0, 0].max() < 0.1
+
+
+def test_a_catch_up_holds_no_more_images_than_the_buffer():
+    """Of two observations per new one, through 10 s that were buffered."""
+
+    def images_mb(bus):
+        held = [each.observation for each in bus._estimator._memory.after(-1)]
+        handover = bus._changeover._attempt and bus._changeover._attempt.handover
+        held += [each.observation for each in handover.trail] if handover else []
+        images = {id(each.image_bgr): each.image_bgr for each in held}
+        return sum(image.nbytes for image in images.values() if image is not None) / 1e6
+
+    peaks_mb = []
+
+    class Detector(ScriptedDetector):
+        def get_scene(self, observation):
+            peaks_mb.append(images_mb(bus))
+            return super().get_scene(observation)
+
+    bus = Bus(
+        detector=Detector(lambda index: "Dark" if index >= 150 else "Bright"),
+        modules={"bright": ExactModule(), "dark": ExactModule()},
+        scenes=TABLE,
+        policy=policy(handover="rewind", buffer_mb=1.0, startup_s={"dark": 8.0}),
+        rig=RIG,
+        back_end=Atlas(voxel_m=0.05),
+        log=EventLog(),
+        catch_up_steps=2,
+    )
+    for index in range(400):
+        image_bgr = np.zeros((100, 100, 3), np.uint8)
+        bus.step(replace(observation(index), image_bgr=image_bgr))
+    assert bus.active == "dark"
+    assert 0.9 < max(peaks_mb) <= 1.0 + 0.03

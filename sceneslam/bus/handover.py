@@ -8,7 +8,12 @@ from contextlib import contextmanager
 from dataclasses import replace
 from time import perf_counter_ns
 
-from sceneslam.bus.observation_buffer import BufferedObservation, ObservationBuffer, bridged
+from sceneslam.bus.observation_buffer import (
+    BufferedObservation,
+    ObservationBuffer,
+    bare,
+    bridged,
+)
 from sceneslam.bus.pace import Pace
 from sceneslam.bus.session import ModuleSession
 from sceneslam.types import se3
@@ -151,6 +156,7 @@ class Handover:
                 self._bend(session.tracking, T_bridged_base)
             self._spared_ns, self._given_ns = [], moment.stamp_ns
         if moment is not self.anchor or moment.module == BRIDGED:
+            found.observation = bare(given)  # the memory bounds what is kept of it
             self.trail.append(found)
         if session.hold.suspect_since_ns is not None:
             self._distrust(session.hold.suspect_since_ns)

@@ -123,11 +123,16 @@ class ObservationBuffer:
         return self._moments[count - 1] if count else None
 
     def rewrite(self, moments: list[BufferedObservation]) -> None:
-        """Replace all entries from the first of `moments` on by these, with corrected poses."""
+        """Replace all entries from the first of `moments` on by these, with corrected poses.
+
+        What is left of their sensor data is kept.
+        """
         before_ns = moments[0].stamp_ns - 1
+        known = {each.stamp_ns: each.observation for each in self.after(before_ns)}
         del self._moments[_count(self._moments, before_ns) :]
         self._drop(slice(_count(self._full, before_ns), None))
         for moment in moments:
+            moment.observation = known.get(moment.stamp_ns, moment.observation)
             self._append(moment)
 
     def clear(self) -> None:
@@ -156,8 +161,12 @@ class ObservationBuffer:
         """Remove the sensor data of one entry."""
         moment = self._full.pop(full)
         self._bytes -= _size(moment.observation)
-        bare = replace(moment.observation, **dict.fromkeys(_BULKY))  # type: ignore[arg-type]
-        moment.observation = bare
+        moment.observation = bare(moment.observation)
+
+
+def bare(observation: Observation) -> Observation:
+    """Return an observation without its sensor data, but for scans, wheels and gyro."""
+    return replace(observation, **dict.fromkeys(_BULKY))  # type: ignore[arg-type]
 
 
 def _count(moments: list[BufferedObservation], stamp_ns: int) -> int:
