@@ -90,6 +90,18 @@ class Drive:
         """Return the same of the poses (N,) as the atlas got them, without any loop."""
         return _apart_m(np.array(self.reckoned), true, T_map_world)
 
+    def loops_off_m(self, true: NDArray[np.float64]) -> list[float]:
+        """Return the error of the motion between the ends of every loop, of true poses (N, 3)."""
+        found = self.atlas.trajectory
+        T_map_base = [planar.from_transform(T) for T in found.T_world_base]
+        off_m = []
+        for loop in self.of_kind("loop"):
+            first, second = np.searchsorted(found.stamps_ns, [loop["to_ns"], loop["stamp_ns"]])
+            moved = planar.between(T_map_base[first], T_map_base[second])
+            due = planar.between(true[first], true[second])
+            off_m.append(float(np.linalg.norm((moved - due)[:2])))
+        return off_m
+
     def of_kind(self, event: str) -> list[dict[str, Any]]:
         """Return the events of one kind."""
         return [one for one in self.events if one["event"] == event]
