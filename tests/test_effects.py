@@ -216,7 +216,7 @@ ON_ANYTHING = {"faults", "laps"}
 
 @pytest.mark.parametrize("name", EVERY)
 def test_an_effect_on_a_sensor_that_the_source_lacks_is_refused(name: str, tmp_path: Path) -> None:
-    (tmp_path / "times.txt").write_text("1.0 0.01\n")
+    (tmp_path / "times.txt").write_text("5.0 0.01\n")
     words = [f"effects={name}", "seed=1", "+effects.source=null"]
     words += [f"effects.path={tmp_path}/times.txt"] if name == "exposure_times" else []
     with initialize_config_module("sceneslam.conf", version_base="1.3"):

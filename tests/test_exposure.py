@@ -1,6 +1,7 @@
 """Exposure: what sources report of it, and the detector that uses it."""
 
 from dataclasses import replace
+from itertools import islice
 
 import numpy as np
 import pytest
@@ -42,11 +43,29 @@ def test_automatic_exposure_hides_darkness_from_the_image_alone():
 
 def test_exposures_of_a_file_reach_the_images(tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path))
-    (tmp_path / "times.txt").write_text("# stamp_s exposure_s gain\n5.0 0.01 1\n15.0 0.02 4\n")
+    (tmp_path / "times.txt").write_text("# stamp_s exposure_s gain\n5.0 0.01 1\n5.5 0.02 4\n")
     effect = ExposureTimes(film(), path="~/times.txt", reference_s=0.01)
-    ratios = [one.exposure_ratio for one in effect]
-    assert ratios[0] == 1.0 and ratios[49] == 1.0 and ratios[-1] == pytest.approx(8.0)
-    assert effect.ground_truth() is not None
+    ratios = [one.exposure_ratio for one in islice(effect, 6)]
+    assert ratios[0] == 1.0 and ratios[2] == 1.0 and ratios[-1] == pytest.approx(8.0)
+    assert effect.ground_truth() is not None and effect.faults == []
+
+
+def test_image_that_the_file_does_not_list_keeps_its_exposure_and_is_a_fault(tmp_path):
+    (tmp_path / "times.txt").write_text("5.0 0.01\n5.5 0.02\n")
+    effect = ExposureTimes(film(), path=str(tmp_path / "times.txt"), reference_s=0.01)
+    for _ in range(2):
+        ratios = [one.exposure_ratio for one in effect]
+        assert ratios[15] == pytest.approx(2.0) and ratios[16:] == [None] * 85
+        (fault,) = effect.faults
+        assert "image without an exposure within 1 s" in fault and "85 times" in fault
+        assert "first at stamp 6.600000 s" in fault
+
+
+@pytest.mark.parametrize("stamp_s", [1.7e9, 3.9, 16.1])
+def test_file_of_exposures_on_another_clock_is_refused(tmp_path, stamp_s):
+    (tmp_path / "times.txt").write_text(f"{stamp_s} 0.01\n")
+    with pytest.raises(InputError, match=r"5\.000 to 15\.000 s, have no time in common.*times"):
+        ExposureTimes(film(), path=str(tmp_path / "times.txt"), reference_s=None)
 
 
 @pytest.mark.parametrize("text", ["", "5.0\n", "5.0 0.01 1 2\n", "5.0 0\n", "6 1\n5 1\n", "a b\n"])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,12 +11,14 @@ from numpy.typing import NDArray
 
 from sceneslam.interfaces import Source
 from sceneslam.sources.changes.wrapped import Wrapped, check_sensor
+from sceneslam.sources.faults import FaultLog, at_stamp
 from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.input_files import given_path, read_text
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Sensor
 
 _COLUMNS = "`stamp_s exposure_s` or `stamp_s exposure_s gain`, the stamps rising, the rest above 0"
+_APART_MAX_S = 1.0  # from an image to its line; longer, and the clocks differ or a line is missing
 
 
 class ExposureTimes(Wrapped):
@@ -24,6 +26,8 @@ class ExposureTimes(Wrapped):
 
     A line of the file is `stamp_s exposure_s` or `stamp_s exposure_s gain`; `#` begins a comment.
     `reference_s` is the product of time and gain that counts as 1 (null: the median of the file).
+    An image without a line within a second keeps the exposure that it has, which is a fault. Raises
+    InputError if the file and the source's time span are apart.
     """
 
     def __init__(self, source: Source, path: str, reference_s: float | None) -> None:
@@ -32,20 +36,44 @@ class ExposureTimes(Wrapped):
         check_sensor(source, Sensor.IMAGE, path=path)
         super().__init__(source)
         rows = _read(given_path(path))
+        self._log = FaultLog()
         self._stamps_s = rows[:, 0]
+        self._check_span(path)
         exposures_s = rows[:, 1:].prod(axis=1)
         self._ratios = exposures_s / (reference_s or float(np.median(exposures_s)))
 
+    @property
+    def faults(self) -> Sequence[str]:
+        """Return the source's faults, and the number of images without an exposure."""
+        return [*self._source.faults, *self._log.sentences()]
+
     def __iter__(self) -> Iterator[Observation]:
         """Yield the source's observations, images with their exposure."""
+        self._log.clear()
         for observation in self._source:
-            if observation.image_bgr is None:
-                yield observation
-            else:
-                yield replace(observation, exposure_ratio=self._ratio(observation.stamp_ns * 1e-9))
+            yield observation if observation.image_bgr is None else self._exposed(observation)
 
-    def _ratio(self, stamp_s: float) -> float:
-        return float(self._ratios[int(np.argmin(np.abs(self._stamps_s - stamp_s)))])
+    def _exposed(self, observation: Observation) -> Observation:
+        apart_s = np.abs(self._stamps_s - observation.stamp_ns * 1e-9)
+        nearest = int(np.argmin(apart_s))
+        if apart_s[nearest] > _APART_MAX_S:
+            kind = f"image without an exposure within {_APART_MAX_S:g} s in effects.path"
+            self._log.add(kind, at_stamp(observation.stamp_ns))
+            return observation
+        return replace(observation, exposure_ratio=float(self._ratios[nearest]))
+
+    def _check_span(self, path: str) -> None:
+        """Raise InputError if no line can belong to an image of the source's time span."""
+        span = self.span
+        if span is None:
+            return
+        start_s, end_s = span.start_ns * 1e-9, span.end_ns * 1e-9
+        first_s, last_s = float(self._stamps_s[0]), float(self._stamps_s[-1])
+        if first_s > end_s + _APART_MAX_S or last_s < start_s - _APART_MAX_S:
+            raise InputError(
+                f"exposures of {first_s:.3f} to {last_s:.3f} s and the recording, {start_s:.3f} to "
+                f"{end_s:.3f} s, have no time in common: {path}"
+            )
 
 
 def _read(path: Path) -> NDArray[np.float64]:
