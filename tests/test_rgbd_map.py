@@ -287,6 +287,22 @@ def test_surfaces_agree_from_another_pose_of_a_camera_with_distortion(monkeypatc
         assert not recognizer._shows(keyframe, T_local_base, 0.98 * depth_m)
 
 
+@pytest.mark.parametrize("stride_px", [1, 8, 64, 100])
+def test_surfaces_are_compared_with_any_stride_of_the_cloud(stride_px):
+    layers = LayerBuilder(
+        CAMERA, cloud_stride_px=stride_px, cloud_voxel_m=0.03, grid_resolution_m=0.05
+    )
+    wall_m, image_bgr = np.full((480, 640), 2.0, np.float32), np.zeros((480, 640, 3), np.uint8)
+    keyframe = keyframe_at(0)
+    keyframe.view = layers.view(wall_m, image_bgr, stamp_ns=0)
+    recognizer = recognition.PlaceRecognizer(empty_map(CAMERA), None, min_inliers=20)
+    beside = se3.from_xy_yaw(0.0, 0.4, 0.0)
+    assert recognizer._shows(keyframe, beside, wall_m)
+    assert not recognizer._shows(keyframe, beside, 1.5 * wall_m)
+    sliver_m = np.where(np.arange(640) < 8, wall_m, np.float32(0.0))
+    assert not recognizer._shows(keyframe, se3.identity(), sliver_m)
+
+
 @pytest.mark.parametrize(("height_m", "has_scans"), [(0.0, True), (0.5, False)])
 def test_only_a_robot_in_the_plane_gives_scans(height_m, has_scans):
     layers = LayerBuilder(CAMERA, cloud_stride_px=8, cloud_voxel_m=0.03, grid_resolution_m=0.05)
