@@ -309,6 +309,18 @@ def test_a_correction_is_updated_where_it_changed_by_a_centimetre_and_at_its_end
         assert (changes.stamps_ns // S).tolist() == rows
 
 
+def test_nodes_that_a_correction_has_no_more_take_its_values_there():
+    before = corrections(0.0, 0.0, 50.0, 50.0, stamps_s=[0, 4, 9, 12])
+    after = corrections(0.0, 0.02, 0.06, stamps_s=[0, 4, 10])
+    changes = after.changes(before)
+    assert (changes.stamps_ns // S).tolist() == [4, 9, 10, 12]
+    updated = before.updated(changes)
+    later = np.arange(0, 20) * S
+    poses = np.array([at(float(k)) for k in range(20)])
+    np.testing.assert_allclose(updated.apply(later, poses), after.apply(later, poses), atol=1e-9)
+    assert (after.changes(updated).stamps_ns // S).tolist() == [12]  # each is told once
+
+
 def test_a_correction_is_cut_before_replaced_poses_but_for_its_first_node():
     whole = corrections(0.1, 0.2, 0.3)
     for second, left in ((3, 3), (2, 2), (1, 1), (0, 1)):

@@ -32,16 +32,20 @@ class Correction:
     def changes(self, before: Correction) -> Correction:
         """Return the nodes that differ by 1 cm or 0.3 degrees from those of another correction.
 
-        And the newest one, whatever it is.
+        And the newest one, whatever it is. Nodes that only the other has count with this one's
+        value there, as `updated` drops none.
         """
-        keep = np.ones(len(self.stamps_ns), bool)
+        gone_ns = np.setdiff1d(before.stamps_ns, self.stamps_ns)
+        T_gone = self.apply(gone_ns, np.tile(se3.identity(), (len(gone_ns), 1, 1)))
+        whole = self.updated(Correction(stamps_ns=gone_ns, T_new_old=T_gone))
+        keep = np.ones(len(whole.stamps_ns), bool)
         _, rows, known = np.intersect1d(
-            self.stamps_ns[:-1], before.stamps_ns, assume_unique=True, return_indices=True
+            whole.stamps_ns[:-1], before.stamps_ns, assume_unique=True, return_indices=True
         )
-        off = se3.inverse(before.T_new_old[known]) @ self.T_new_old[rows]
+        off = se3.inverse(before.T_new_old[known]) @ whole.T_new_old[rows]
         is_far = np.linalg.norm(off[:, :3, 3], axis=1) > _FELT_M
         keep[rows] = is_far | (se3.rotation_angle_rad(off) > _FELT_RAD)
-        return Correction(stamps_ns=self.stamps_ns[keep], T_new_old=self.T_new_old[keep])
+        return Correction(stamps_ns=whole.stamps_ns[keep], T_new_old=whole.T_new_old[keep])
 
     def updated(self, changes: Correction) -> Correction:
         """Return the correction with other values at the nodes of `changes`."""
