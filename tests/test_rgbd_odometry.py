@@ -14,8 +14,11 @@ from sceneslam.types.observation import TrackingStatus
 YAML = Path(__file__).parents[1] / "conf" / "slam" / "rgbd.yaml"
 
 
-def drive_away_in_the_dark(*, has_odometry):
-    """See one wall, turn round in the dark, and see another; return the answers."""
+def drive_away_in_the_dark(*, without_odometry=()):
+    """See one wall, turn round in the dark, and see another; return the answers.
+
+    `without_odometry`: the observations that miss it.
+    """
     config = OmegaConf.merge(
         {"seed": 0, "run": {"is_repeatable": True}}, {"node": OmegaConf.load(YAML)}
     ).node
@@ -31,13 +34,14 @@ def drive_away_in_the_dark(*, has_odometry):
         there = turned @ se3.from_xy_yaw(0.01 * step, 0, 0)
         observations.append(observation_at(there, (16 + step) / 30))
     observations = [replace(o, gyro_base=None) for o in observations]  # it knows no such turn
-    if not has_odometry:
-        observations = [replace(o, T_odom_base=None) for o in observations]
-    return [module.track(observation) for observation in observations], turned
+    for index in without_odometry:
+        observations[index] = replace(observations[index], T_odom_base=None)
+    answers = [module.track(observation) for observation in observations]
+    return answers, turned, module.get_map().pose_graph
 
 
 def test_new_place_is_hung_on_odometry_after_it_was_looked_for_in_the_map():
-    answers, turned = drive_away_in_the_dark(has_odometry=True)
+    answers, turned, _ = drive_away_in_the_dark()
     assert {answer.status for answer in answers[6:16]} == {TrackingStatus.LOST}
     assert {answer.status for answer in answers[16:19]} == {TrackingStatus.LOST}
     assert answers[19].status is TrackingStatus.DEGRADED
@@ -50,6 +54,15 @@ def test_new_place_is_hung_on_odometry_after_it_was_looked_for_in_the_map():
     assert np.linalg.norm(error[:3, 3]) < 0.05 and se3.rotation_angle_rad(error) < 0.03
 
 
+def test_new_place_is_as_uncertain_as_the_drive_to_it_after_odometry_with_a_gap():
+    answers, _, graph = drive_away_in_the_dark(without_odometry=[3])
+    assert answers[3].status is answers[5].status is TrackingStatus.TRACKING
+    assert graph.edges[0].tolist() == [0, 1]
+    covariance = np.linalg.inv(graph.information[0])
+    np.testing.assert_allclose(covariance, answers[19].covariance, atol=1e-9)
+    assert np.sqrt(covariance[5, 5]) > 0.06  # after 2 rad
+
+
 def test_new_place_stays_lost_without_odometry():
-    answers, _ = drive_away_in_the_dark(has_odometry=False)
+    answers, _, _ = drive_away_in_the_dark(without_odometry=range(24))
     assert {answer.status for answer in answers[6:]} == {TrackingStatus.LOST}

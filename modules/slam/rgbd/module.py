@@ -156,7 +156,13 @@ class RgbdSlam(LocalModule, RgbdSettings):
         is_placed = prediction.is_measured or begins
         guessed_s = None if is_placed else self._predictor.unmeasured_s(view.observation)
         self._hold_pose(view.observation, view.T_predicted, prediction.covariance)
-        self._held_ids = self._parts.insert(view, self._T_local_base, set(), guessed_s=guessed_s)
+        self._held_ids = self._parts.insert(
+            view,
+            self._T_local_base,
+            set(),
+            predicted=prediction.covariance,
+            guessed_s=guessed_s,
+        )
         self._parts.memory.hold(
             view.observation.stamp_ns, self._T_local_base, np.zeros(0, np.int64)
         )

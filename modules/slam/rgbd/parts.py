@@ -98,12 +98,14 @@ class RgbdParts:
         segment: set[int] | None,
         *,
         fix: VisualFix | None = None,
+        predicted: NDArray[np.float64] | None = None,
         guessed_s: float | None = None,
     ) -> NDArray[np.int64]:
         """Insert a keyframe at a pose (4, 4) and return the ids (N,) of its landmarks.
 
         `segment`: the keyframes whose landmarks these may be, None: all. `fix`: the pose found in
-        the map, None for odometry. `guessed_s`: time without a pose if the pose is a guess.
+        the map, None for odometry, with covariance `predicted` (6, 6). `guessed_s`: time without a
+        pose if the pose is a guess.
         """
         landmark_ids = np.full(len(view.features), NO_LANDMARK)
         if fix is not None:
@@ -123,7 +125,7 @@ class RgbdParts:
         keyframe_id = self.map.insert(keyframe, deep_rows=deep_rows)
         triangulate(self.map, keyframe_id)
         join_duplicates(self.map, keyframe, segment)
-        self.memory.insert(fix, view.depth_m, guessed_s=guessed_s)
+        self.memory.insert(fix, view.depth_m, predicted=predicted, guessed_s=guessed_s)
         self.mapping.insert(keyframe_id, view)
         self.keyframe_rule.restart()
         return np.asarray(landmark_ids[landmark_ids != NO_LANDMARK])

@@ -26,7 +26,7 @@ from .segments import Segments
 from .visual_map import VisualMap
 
 _MIN_SHARE = 0.1  # least share of a pose's landmarks from a keyframe, for an edge to it
-_GUESSED_VARIANCE = 0.05**2  # [m^2] and [rad^2], of a keyframe that odometry does not place
+_GUESSED_VARIANCE = 0.05**2  # [m^2] and [rad^2], of a keyframe placed by an earlier map
 _NEVER_SAW = -1
 
 
@@ -82,17 +82,23 @@ class MapHistory:
         return [se3.inverse(self._map.keyframes[k].T_local_base) @ T_local_base for k in near]
 
     def insert(
-        self, fix: VisualFix | None, depth_m: NDArray[np.float32] | None, *, guessed_s: float | None
+        self,
+        fix: VisualFix | None,
+        depth_m: NDArray[np.float32] | None,
+        *,
+        predicted: NDArray[np.float64] | None = None,
+        guessed_s: float | None,
     ) -> None:
         """Add the newest keyframe with depth (H, W) [m]; `fix`: its pose, None for odometry.
 
-        `guessed_s`: time without a pose if its pose is a guess; then it begins a segment.
+        `predicted`: covariance (6, 6) of a pose by odometry, None: not known. `guessed_s`: time
+        without a pose if its pose is a guess; then it begins a segment.
         """
         keyframe_id = self._map.keyframes.ids[-1]
         keyframe = self._map.keyframes[keyframe_id]
         self._graph.insert(keyframe_id)
         if guessed_s is None:
-            for edge in self._edges(keyframe_id, fix):
+            for edge in self._edges(keyframe_id, fix, predicted):
                 self._graph.connect(edge)
         else:
             self.segments.begin(keyframe_id, lost_s=guessed_s)
@@ -177,7 +183,9 @@ class MapHistory:
         keyframe_id, T_keyframe_base = self._frames.newest
         return np.asarray(self._keyframes[keyframe_id].T_local_base @ T_keyframe_base)
 
-    def _edges(self, keyframe_id: int, fix: VisualFix | None) -> list[Edge]:
+    def _edges(
+        self, keyframe_id: int, fix: VisualFix | None, predicted: NDArray[np.float64] | None
+    ) -> list[Edge]:
         """Return the edges to the keyframes against which a new keyframe's pose was measured.
 
         A landmark belongs to the keyframe that saw it first; the edge to each such keyframe gets
@@ -191,7 +199,8 @@ class MapHistory:
             last = max(earlier)
             T_last_new = se3.inverse(earlier[last].T_local_base) @ T_local_base
             motion = motion_between(earlier[last], self._map.keyframes[keyframe_id])
-            covariance = _GUESSED_VARIANCE * np.eye(6) if motion is None else motion.covariance
+            covariance = _GUESSED_VARIANCE * np.eye(6) if predicted is None else predicted
+            covariance = covariance if motion is None else motion.covariance
             return [
                 Edge(
                     first=last, second=keyframe_id, T_first_second=T_last_new, covariance=covariance
