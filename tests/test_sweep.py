@@ -157,12 +157,54 @@ def ended(sweep, *states):
     return folders
 
 
+def lacking(folder, *, faults=(), error="only 8 % got a pose"):
+    """Give a job that ended with these failures of modules, and this error, its metrics."""
+    metrics = {"faults": list(faults), "shortfalls": ["only 8 % got a pose"]}
+    (folder / "metrics.json").write_text(json.dumps(metrics))
+    Status(state=State.INCOMPLETE, error=error, overrides=[f"a={folder.name}"]).write(folder)
+
+
 @pytest.mark.parametrize(("last", "code"), [(State.DONE, 0), (State.INCOMPLETE, 1)])
-def test_incomplete_job_is_told_by_the_exit_code_and_not_run_again(tmp_path, last, code):
+def test_job_that_lacks_poses_is_told_by_the_exit_code_and_not_run_again(tmp_path, last, code):
     folders = ended(tmp_path, State.DONE, last)
+    if last is State.INCOMPLETE:
+        lacking(folders[1])
     assert run_sweep(tmp_path, folders, {"backend": "basic"}, tmp_path) is (code == 0)
     assert main([str(tmp_path)]) == code
     assert Status.read(folders[1]).state is last
+
+
+@pytest.mark.parametrize(
+    "why",
+    [
+        {"error": "the map could not all be saved: no space left; only 8 % got a pose"},
+        {"faults": ["slam.bright was killed by signal 9 (SIGKILL)"]},
+    ],
+)
+def test_job_that_a_cause_of_the_moment_left_incomplete_is_run_again(tmp_path, why):
+    folders = ended(tmp_path, State.DONE, State.INCOMPLETE)
+    lacking(folders[1], **why)
+    assert not run_sweep(tmp_path, folders, {"backend": "basic"}, tmp_path)
+    assert Status.read(folders[0]).state is State.DONE
+    assert Status.read(folders[1]).state is State.FAILED  # it ran: there is nothing to run here
+
+
+@pytest.mark.parametrize("how", ["command", "resume"])
+def test_job_of_a_damaged_recording_is_run_again_once_it_is_repaired(folder, how):
+    recording = (folder / "room.mcap").resolve().read_bytes()
+    (folder / "room.mcap").unlink()
+    (folder / "room.mcap").write_bytes(recording[: len(recording) // 2])
+    words = (*JOBS, "policy.retry_s=0,1", "hydra.sweep.dir=out")
+    code, out, errors = sweep(folder, *words)
+    assert code == 1 and "2 jobs: 2 incomplete" in out, errors
+    (folder / "room.mcap").write_bytes(recording)
+    if how == "command":
+        code, out, errors = sweep(folder, *words)
+        assert code == 0 and "2 jobs: 2 done" in out, errors
+    else:
+        assert main([str(folder / "out")]) == 0
+    rows = table(folder / "out")
+    assert [(row["status"], row["observations"]) for row in rows] == [("done", "30")] * 2
 
 
 def test_table_holds_no_job_of_an_earlier_command(tmp_path, capsys):

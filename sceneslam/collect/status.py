@@ -41,13 +41,26 @@ class Status:
 
     @property
     def is_finished(self) -> bool:
-        """Tell whether its metrics are final: another run would give the same."""
+        """Tell whether it came to its end, so that its metrics count."""
         return self.state in (State.DONE, State.INCOMPLETE)
 
     @property
     def is_settled(self) -> bool:
         """Tell whether it has ended, in any state."""
         return self.state not in (State.WAITING, State.RUNNING)
+
+    def is_final(self, folder: Path) -> bool:
+        """Tell whether another run would give the same: it is done, or lacks nothing but poses.
+
+        Damaged input may be repaired by then, and a disk or memory that was full have room.
+        """
+        if self.state is not State.INCOMPLETE:
+            return self.state is State.DONE
+        try:
+            metrics = json.loads((folder / "metrics.json").read_text())
+            return not metrics["faults"] and self.error == "; ".join(metrics["shortfalls"])
+        except (OSError, KeyError, TypeError, ValueError):
+            return False
 
     def now(self, state: State, error: str = "", **values: Any) -> Status:
         """Return the same job in another state."""

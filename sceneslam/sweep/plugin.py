@@ -37,7 +37,7 @@ COMPOSED = ".composed.pickle"  # a job's configuration with Hydra's own part
 
 
 class SweepLauncher(Launcher):
-    """Runs jobs by a backend; jobs that are already finished in their folder are kept."""
+    """Runs jobs by a backend; jobs that are already final in their folder are kept."""
 
     def __init__(self, backend: str, **settings: Any) -> None:
         plain = OmegaConf.to_container(OmegaConf.create(settings), resolve=True)
@@ -150,10 +150,10 @@ def _maps(config: DictConfig) -> dict[str, Any]:
 
 
 def _prepare(folder: Path, config: DictConfig) -> None:
-    """Write a job's files, unless the same job is finished in its folder."""
+    """Write a job's files, unless the same job is final in its folder."""
     digest = hashlib.sha256(OmegaConf.to_yaml(without_hydra(config)).encode()).hexdigest()
     before = Status.read(folder)
-    if before is not None and before.is_finished and before.config_sha256 == digest:
+    if before is not None and before.is_final(folder) and before.config_sha256 == digest:
         return
     with closing(RunFolder.claim(folder, key="hydra.sweep.subdir")):
         with (folder / COMPOSED).open("wb") as file:

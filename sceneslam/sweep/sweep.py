@@ -29,9 +29,10 @@ _TOLD_ERRORS = 10
 def run_sweep(
     sweep: Path, folders: Sequence[Path], launcher: Mapping[str, Any], began_in: Path
 ) -> bool:
-    """Run the jobs that are not finished; return whether all are complete. Writes the table.
+    """Run the jobs that are not final; return whether all are complete. Writes the table.
 
-    An incomplete job, such as one of damaged input, is finished: another run would give the same.
+    A job that only lacks poses is final. Other incomplete ones, such as one of damaged input or of
+    a full disk, are run again.
 
     `launcher` has the name of a backend, in `backend`, and its settings; `began_in` is the base
     folder of relative paths.
@@ -45,7 +46,7 @@ def run_sweep(
         file.write(json.dumps(kept, indent=2) + "\n")
     stop = own / "stop"
     stop.unlink(missing_ok=True)
-    missing = [folder for folder in folders if not _is_finished(folder)]
+    missing = [folder for folder in folders if not _status(folder).is_final(folder)]
     for folder in missing:
         _status(folder).now(State.WAITING, wall_s=None).write(folder)
     if missing:
@@ -106,7 +107,3 @@ def _backend(launcher: Mapping[str, Any]) -> Backend:
 
 def _status(folder: Path) -> Status:
     return Status.read(folder) or Status(state=State.WAITING)
-
-
-def _is_finished(folder: Path) -> bool:
-    return _status(folder).is_finished
