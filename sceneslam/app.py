@@ -44,6 +44,7 @@ class Finished:
     map: HybridMap
     truth: GroundTruth | None
     faults: tuple[str, ...]  # errors of the input, or why the run ended early
+    input_faults: tuple[str, ...]  # those of them that the input will give again
     is_interrupted: bool  # by Ctrl-C or SIGTERM
     is_stop_requested: bool  # by one of them, also while the results were saved
 
@@ -129,6 +130,7 @@ def _end(
         map=result.map,
         truth=loop.truth,
         faults=tuple(results.faults),
+        input_faults=() if results.source is None else tuple(results.source.faults),
         is_interrupted=loop.is_interrupted,
         is_stop_requested=loop.is_interrupted or requests.is_any,
     )

@@ -47,7 +47,8 @@ def run_experiment(config: DictConfig, folder: Path) -> Verdict:
     """Run all trials of the experiment at the key that `experiment` names; write its verdict.
 
     A trial that is already finished with the same configuration, code and input is not run again:
-    an experiment that was stopped continues if it is called with the same `hydra.run.dir`. Raises
+    an experiment that was stopped continues if it is called with the same `hydra.run.dir`. One with
+    other errors than those of its input, such as of a full disk or memory, is run again. Raises
     ConfigError or InputError if a trial cannot be run.
     """
     key = str(config.experiment)
@@ -189,17 +190,19 @@ def _run_unless_finished(config: dict[str, Any], folder: Path, name: str) -> Non
         return
     (folder / _END).unlink(missing_ok=True)
     faults: tuple[str, ...] = ()
-    is_stop_requested = False
+    is_final, is_stop_requested = True, False
     if config["run"]["mode"] == DETECT_ONLY:
         faults = detect(config, folder)
+        is_final = not faults
     else:
         finished = run(config, folder, title=name)
         if finished.is_interrupted:
             raise KeyboardInterrupt(f"stopped during the trial {name}")
         faults, is_stop_requested = finished.faults, finished.is_stop_requested
+        is_final = set(faults) <= set(finished.input_faults)
         if lost := [one for one in _READ if not (folder / one).is_file()]:
             raise InputError(f"{lost[0]} of a trial is missing: {'; '.join(faults)}: {folder}")
-    end = {"made_by": made_by, "faults": faults}
+    end = {"made_by": made_by, "faults": faults, "is_final": is_final}
     with replacing(folder / _END) as file:
         file.write(json.dumps(end, indent=2))
     if is_stop_requested:
@@ -228,9 +231,10 @@ def _read(path: Path, is_there: bool) -> Trajectory:
 
 
 def _finished_by(folder: Path) -> dict[str, str] | None:
-    """Return the provenance of the finished trial in a folder, None without one."""
+    """Return the provenance of the finished trial in a folder; None: it is to be run again."""
     path = folder / _END
     if not path.is_file():
         return None
-    made_by: dict[str, str] = json.loads(path.read_text())["made_by"]
-    return made_by
+    end = json.loads(path.read_text())
+    made_by: dict[str, str] = end["made_by"]
+    return made_by if end.get("is_final", True) else None

@@ -234,6 +234,31 @@ def test_a_trial_whose_metrics_could_not_be_saved_is_run_again(tmp_path, monkeyp
     assert (tmp_path / "metrics.json").is_file() and (tmp_path / "finished.json").is_file()
 
 
+@pytest.mark.parametrize(
+    ("changes", "cause", "is_again"),
+    [
+        ({}, "sceneslam.results.save_map", True),
+        ({"source__breaks_at": 70}, None, True),
+        ({"source__fault": "damaged at 2 s"}, None, False),
+        ({}, None, False),
+    ],
+)
+def test_a_trial_is_run_again_if_its_errors_may_be_gone(
+    tmp_path, monkeypatch, changes, cause, is_again
+):
+    def fail(*_):
+        raise MemoryError
+
+    settings = config(run__report=False, **changes)
+    with monkeypatch.context() as full:
+        if cause is not None:
+            full.setattr(cause, fail)
+        _run_unless_finished(settings, tmp_path, "trial")
+    was = (tmp_path / "metrics.json").stat().st_mtime_ns
+    _run_unless_finished(settings, tmp_path, "trial")
+    assert ((tmp_path / "metrics.json").stat().st_mtime_ns != was) is is_again
+
+
 def changed(name):
     """Give a configuration that names a file, and the file with another content later."""
     pen = Path("pen")  # relative, as a command line gives it
