@@ -1,5 +1,7 @@
 """The rgbd map's history: which keyframes are connected, and how certain their edges are."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from rgbd_features import empty_map
@@ -50,3 +52,19 @@ def test_segment_that_a_loop_joins_where_it_is_needs_no_guess_any_more(history, 
         assert history.step() is None
     assert history.pose_graph().is_loop.tolist() == [True]
     assert not history.segments.are_many
+
+
+@pytest.mark.parametrize(
+    ("counts", "connected"), [([4, 4, 4], [0, 1, 2]), ([6, 7] + 10 * [6], [1]), ([19, 1], [0])]
+)
+def test_keyframe_is_connected_to_most_owners_of_its_landmarks(history, counts, connected):
+    """To each with more than a tenth of them, or to the one with most of many."""
+    for owner in range(len(counts)):
+        insert(history, 0.1 * owner)
+    owned = history._map.keyframes.owned_landmarks()
+    shown = np.concatenate([owned[k][:count] for k, count in enumerate(counts)])
+    estimate = SimpleNamespace(covariance=1e-4 * np.eye(6))
+    newest = keyframe_at(0.1 * len(counts), shown, count=80)
+    history._map.insert(newest, deep_rows=np.zeros(0, np.int64))
+    history.insert(SimpleNamespace(landmark_ids=shown, estimate=estimate), None, guessed_s=None)
+    assert history._graph.neighbours(len(counts)) == connected

@@ -189,7 +189,8 @@ class MapHistory:
         """Return the edges to the keyframes against which a new keyframe's pose was measured.
 
         A landmark belongs to the keyframe that saw it first; the edge to each such keyframe gets
-        its landmarks' share of the information, so that nothing is counted twice.
+        its landmarks' share of the information, so that nothing is counted twice. Small shares get
+        none, but the largest one gets an edge however small it is.
         """
         earlier = self._keyframes
         if not earlier:
@@ -208,6 +209,7 @@ class MapHistory:
             ]
         counts = self._origins(fix.landmark_ids)
         total = sum(counts.values())
+        most = max((count for k, count in counts.items() if k in earlier), default=0)
         return [
             _edge(
                 k,
@@ -216,7 +218,7 @@ class MapHistory:
                 fix.estimate.covariance * (total / count),
             )
             for k, count in counts.items()
-            if k in earlier and count > _MIN_SHARE * total
+            if k in earlier and (count > _MIN_SHARE * total or count == most)
         ]
 
     def _origins(self, landmark_ids: NDArray[np.int64]) -> dict[int, int]:
