@@ -16,6 +16,7 @@ from test_sink_ros2 import at, seen
 from sceneslam.modules.maps.live_map import GridAndPoints
 from sceneslam.ros.messages import MessageDecoder, TopicType
 from sceneslam.sinks.foxglove import FoxgloveSink
+from sceneslam.types import se3
 from sceneslam.types.command import Pause, SelectScene
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import Observation
@@ -104,6 +105,32 @@ def test_poses_frames_pictures_and_map_are_shown(sink, client):
     assert decoded(client, "/sceneslam/odometry").header.frame_id == "map"
     is_over.set()
     thread.join()
+
+
+def test_after_a_reset_of_odometry_and_clock_the_robot_is_where_the_map_says(sink, client):
+    """The run has smooth odometry and stamps; what is published fits the robot's own."""
+    T_smooth_odom, T_map_base = se3.from_xy_yaw(10.0, 0.0, 1.0), at(1.0)
+    jump = {"event": "odometry_jump", "stamp_ns": 0, "T_smooth_odom": T_smooth_odom.tolist()}
+    sink.write_event(jump)
+    sink.write_event({"event": "clock_jump", "stamp_ns": 0, "shift_ns": 100 * S, "paces": True})
+    client.subscribe("/tf")
+    tick, found = threading.Event(), {}
+    for _ in range(100):
+        sink.write(Observation(stamp_ns=101 * S, T_odom_base=at(3.0)), T_map_base, "laser")
+        tick.wait(0.02)
+    while len(found) < 2:
+        (one,) = decoded(client, "/tf").transforms
+        found[one.child_frame_id] = one
+    moves = [found[name].transform for name in ("odom", "base_link")]
+    T_map_odom, T_odom_base = (
+        se3.from_quat_xyzw(
+            np.array([one.translation.x, one.translation.y, one.translation.z]),
+            np.array([one.rotation.x, one.rotation.y, one.rotation.z, one.rotation.w]),
+        )
+        for one in moves
+    )
+    np.testing.assert_allclose(T_map_odom @ T_odom_base, T_map_base, atol=1e-9)
+    assert {one.header.stamp.sec for one in found.values()} == {1}
 
 
 def test_who_connects_late_hears_who_works_and_why(sink, client):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from sceneslam.ros.pixels import image_options
 from sceneslam.ros.transport.transport import Qos, Transport
 from sceneslam.sinks.ros2 import requests
 from sceneslam.sinks.ros2.topics import TopicSink
+from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError, text_of
 from sceneslam.types.files import replacing
 from sceneslam.types.observation import Observation
@@ -85,13 +87,14 @@ class FoxgloveSink(TopicSink):
             file.write(layout)
 
     def write(self, observation: Observation, T_map_base: Transform | None, module: str) -> None:
-        """Publish an observation and its pose."""
-        stamp_ns = observation.stamp_ns
+        """Publish an observation and its pose, as the robot's clock and odometry have them."""
+        stamp_ns, scan = observation.stamp_ns - self._shift_ns, observation.scan
         if T_map_base is not None and observation.T_odom_base is not None:
-            children = {names.BASE: observation.T_odom_base}
+            children = {names.BASE: se3.inverse(self._T_smooth_odom) @ observation.T_odom_base}
             self.send(names.TF, self.encoder.transforms(stamp_ns, names.ODOM, children))
-        if observation.scan is not None:
-            self._show(names.SCAN, self.encoder.scan(observation.scan))
+        if scan is not None:
+            scan = replace(scan, stamp_ns=scan.stamp_ns - self._shift_ns)
+            self._show(names.SCAN, self.encoder.scan(scan))
         if observation.image_bgr is not None:
             self._show_image(stamp_ns, observation.image_bgr)
         super().write(observation, T_map_base, module)
