@@ -224,6 +224,26 @@ def test_a_warning_without_a_stamp_does_not_begin_the_recording(tmp_path: Path) 
     assert len(list(open_recording(tmp_path / "run.mcap").messages({names.RESULT_EVENTS}))) == 1
 
 
+def test_truth_that_is_longer_than_the_run_moves_neither_map_nor_path(tmp_path: Path) -> None:
+    sink = McapSink("run.mcap", "jpeg", 75, 1, 2)
+    sink.open(RIG, tmp_path)
+    (made,) = observations(1)
+    sink.write(made, np.eye(4), "visual")
+    later_ns = made.stamp_ns + np.array([30, 600]) * 10**9
+    path = Trajectory(stamps_ns=later_ns, T_world_base=np.stack([np.eye(4)] * 2))
+    sink.write_truth(GroundTruth(trajectory=path, scenes=()))
+    run = Trajectory(stamps_ns=np.array([made.stamp_ns]), T_world_base=np.eye(4)[None])
+    none = SimpleNamespace(grid=None, points=PointLayer(points=np.zeros((0, 3), np.float32)))
+    sink.write_result(SimpleNamespace(trajectory=run, map=none))
+    sink.close()
+    recording = open_recording(tmp_path / "run.mcap")
+    (told,) = recording.messages({names.RESULT_PATH})
+    assert told.log_ns == made.stamp_ns
+    frames = [recording.decode(one) for one in recording.messages({names.TF_STATIC})]
+    children = {each.child_frame_id for one in frames for each in one.transforms}
+    assert names.GT not in children  # where the truth lies in the map is not known
+
+
 def test_recordings_open_with_the_reference_reader(tmp_path: Path) -> None:
     from mcap.reader import make_reader
 

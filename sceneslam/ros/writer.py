@@ -24,6 +24,7 @@ from sceneslam.types.trajectory import Trajectory
 from sceneslam.types.truth import GroundTruth
 
 _CHUNK_BYTES = 256 * 1024  # largest loss if the file is cut off
+_TRUTH_GAP_NS = 50_000_000  # between a pose and its true one, at most
 _DEPTH_UNITS_PER_M = 1000.0
 
 
@@ -120,8 +121,9 @@ class ObservationWriter:
     def write_truth(self, truth: GroundTruth) -> None:
         """Add all true poses (float64) and scene changes; at any time before `close`.
 
-        With results, frame `gt` is aligned with `map` at the first pose of both.
+        With results, frame `gt` is aligned with `map` at the first pose, if the truth begins by it.
         """
+        last_ns = self._last_ns
         self._write_truth_frame(truth.trajectory)
         for stamp_ns, T_gt_base in zip(
             truth.trajectory.stamps_ns.tolist(), truth.trajectory.T_world_base, strict=True
@@ -130,6 +132,7 @@ class ObservationWriter:
             self._add(names.TRUTH_ODOMETRY, stamp_ns, data)
         for change in truth.scenes:
             self._add(names.TRUTH_SCENE, change.stamp_ns, self._encoder.text(change.scene))
+        self._last_ns = last_ns  # the truth may be longer than the run
 
     def close(self) -> None:
         """Close the file; a second call does nothing."""
@@ -161,7 +164,10 @@ class ObservationWriter:
         if self._first_pose is None or not len(trajectory):
             return
         stamp_ns, T_map_base = self._first_pose
-        nearest = int(np.abs(trajectory.stamps_ns - stamp_ns).argmin())
+        apart_ns = np.abs(trajectory.stamps_ns - stamp_ns)
+        nearest = int(apart_ns.argmin())
+        if apart_ns[nearest] > _TRUTH_GAP_NS:
+            return
         T_map_gt = T_map_base @ se3.inverse(trajectory.T_world_base[nearest])
         data = self._encoder.transforms(stamp_ns, names.MAP, {names.GT: T_map_gt})
         self._add(names.TF_STATIC, stamp_ns, data)
