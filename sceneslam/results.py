@@ -6,7 +6,7 @@ import logging
 import resource
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from sceneslam.evaluation.settings import EvaluationSettings
 from sceneslam.interfaces import Source
 from sceneslam.sources.changes.wrapped import logged_ns
 from sceneslam.types.errors import text_of
+from sceneslam.types.maps import HybridMap
 from sceneslam.types.run import RunResult
 from sceneslam.types.trajectory import Trajectory
 from sceneslam.types.truth import GroundTruth
@@ -101,7 +102,7 @@ class Results:
             if truth is not None and len(truth.trajectory):
                 truth.trajectory.write_tum(self.folder / "groundtruth.tum")
         with self._noting("the map"):
-            save_map(result.map, self.folder / "map")
+            save_map(self._logged(result.map), self.folder / "map")
         if self.has_report:
             with self._noting("the report"):
                 self._write_report(result, truth, metrics, reference)
@@ -122,6 +123,14 @@ class Results:
         if path.is_file():
             with suppress(OSError):  # such as a full disk, which is an error of the run already
                 write_metrics(path, metrics)
+
+    def _logged(self, hybrid: HybridMap) -> HybridMap:
+        """Return a map with the recording's stamps of its pose graph, whose nodes stay in order."""
+        graph = hybrid.pose_graph
+        if graph is None:
+            return hybrid
+        stamps_ns = logged_ns(self.source, graph.stamps_ns)
+        return replace(hybrid, pose_graph=replace(graph, stamps_ns=stamps_ns))
 
     def _write_tum(self, trajectory: Trajectory, name: str) -> None:
         stamps_ns = logged_ns(self.source, trajectory.stamps_ns)

@@ -76,6 +76,17 @@ def test_trajectories_have_the_stamps_of_the_recording(tmp_path):
     np.testing.assert_array_equal(read_covariances(path)[0], late.stamps_ns)
 
 
+def test_the_pose_graph_has_the_stamps_of_the_recording_and_its_vertices_stay_in_order(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setattr(LateStamps, "logged_ns", lambda _, stamps_ns: 100 * 10**9 - stamps_ns)
+    run(config(), tmp_path / "exact")
+    run(config(source___target_="fakes.LateStamps"), tmp_path / "late")
+    exact, late = (np.loadtxt(tmp_path / one / "map/pose_graph.tum") for one in ("exact", "late"))
+    np.testing.assert_allclose(late[:, 0], 100.0 - exact[:, 0])
+    np.testing.assert_array_equal(late[:, 1:], exact[:, 1:])
+
+
 def test_input_that_breaks_off_leaves_what_was_computed(tmp_path):
     finished = run(config(source__breaks_at=70), tmp_path)
     assert finished.faults == ("the recording breaks off: fake.bag",)
