@@ -127,16 +127,17 @@ def test_pieces_stay_apart_where_places_look_alike():
     assert sigmas[-1, :2].min() > 0.9 * LOST_S
 
 
-def test_one_loop_between_two_pieces_is_not_believed_whatever_loops_there_are_within_them():
+def test_a_loop_is_believed_if_another_has_its_ends_in_the_same_pieces():
     graph, cov = RunGraph(empty_map(), lambda session: False), np.diag(np.full(6, 1e-4))
     graph._starts = frozenset([0, 10])
-    within, across, again = (
+    within, beside, later, across, again = (
         Edge(first=a, second=b, T_first_second=np.eye(4), covariance=cov, kind=EdgeKind.LOOP)
-        for a, b in ((0, 5), (2, 15), (3, 16))
+        for a, b in ((0, 5), (1, 6), (11, 17), (2, 15), (3, 16))
     )
-    assert graph._believed([within, across]) == [within]
-    assert graph._believed([within, across, again]) == [within, across, again]
-    assert graph._believed([within]) == [] and graph._believed([across]) == []
+    assert graph._believed([within, beside, across]) == [within, beside]
+    assert graph._believed([within, across, again]) == [across, again]
+    assert graph._believed([within, later]) == graph._believed([within, across]) == []
+    assert graph._believed([within]) == graph._believed([across]) == []
 
 
 def test_a_piece_begins_where_its_module_answered_though_poses_were_guessed_before(

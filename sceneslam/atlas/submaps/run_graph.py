@@ -155,9 +155,9 @@ class RunGraph:
         )
 
     def _believed(self, loops: Sequence[Edge]) -> list[Edge]:
-        """Return the loops but those that are alone between two pieces of the run.
+        """Return the loops but those that are alone within a piece of the run, or between two.
 
-        Nothing measured how these lie, so that no other loop contradicts or confirms one.
+        Nothing measured how pieces lie, so that loops of others neither contradict nor confirm one.
         """
         starts = sorted(self._starts)
         pieces = [
@@ -166,11 +166,7 @@ class RunGraph:
         ]
         counts = Counter(pieces)
         kept = zip(loops, pieces, strict=True)
-        return [
-            loop
-            for loop, ends in kept
-            if counts[ends] > 1 or (len(loops) > 1 and ends[0] == ends[1])
-        ]
+        return [loop for loop, ends in kept if counts[ends] > 1]
 
     def _is_used(self, loop: Edge) -> bool:
         return loop not in self._agreed or fits(loop, self._T_map_node)
