@@ -421,6 +421,19 @@ def test_a_run_that_localizes_saves_no_map(tmp_path):
                .loaded.submaps) == 2  # fmt: skip
 
 
+def test_an_update_forgets_only_at_its_end_as_the_place_may_be_withdrawn(tmp_path):
+    save_map_files(map_of(plan_of("###")), tmp_path)
+    folder = str(tmp_path)
+    own, run = LastingMap(load=folder, save=folder, mode="update", save_every_s=1.0), Mapped()
+    nodes = [[CELL, 2 * CELL, 0], [0, 0, 0]]
+    run.saved = lambda: map_of(plan_of("###"), plan_of(*["....."] * 5), nodes=nodes, runs=[0, 1])
+    for second in range(3):
+        own.keep(second * S, run)
+    assert [len(one.plan) for one in load_map_files(tmp_path).submaps] == [3, 0]
+    own.finish(run, 3 * S, lambda *_, **__: None)
+    assert [len(one.plan) for one in load_map_files(tmp_path).submaps] == [0, 0]
+
+
 @pytest.mark.parametrize(
     ("mode", "is_found"), [("update", True), ("update", False), ("extend", True)]
 )

@@ -82,7 +82,7 @@ class LastingMap:
         is_writing = self._writing is not None and not self._writing.done()
         if mapper.has_submaps and not is_writing:
             self._saved_ns = stamp_ns
-            self._writing = self._executor.submit(self._write, mapper.saved(), mapper.is_found)
+            self._writing = self._executor.submit(self._write, mapper.saved())
 
     def map_of(self, mapper: Mapper) -> SavedMap:
         """Return the map including the run, as it would be saved."""
@@ -101,7 +101,7 @@ class LastingMap:
         saved = mapper.saved()
         if not saved.submaps and seal_of(self._save) is not None:
             self._fault(f"the run has nothing to save, the map that was in {self._save} stays")
-        elif self._write(saved, mapper.is_found):
+        elif self._write(saved, is_found=mapper.is_found):
             loops = sum(edge.is_loop for edge in saved.edges)
             note("map_saved", stamp_ns, submaps=len(saved.submaps), loops=loops)
             if saved.apart:
@@ -122,8 +122,12 @@ class LastingMap:
             return forget_contradicted(saved, self.loaded.runs)
         return saved
 
-    def _write(self, saved: SavedMap, is_found: bool) -> bool:
-        """Save a map; return whether it was possible."""
+    def _write(self, saved: SavedMap, *, is_found: bool = False) -> bool:
+        """Save a map; return whether it was possible.
+
+        `is_found`: the run is over, and located. While it goes on, its place may be withdrawn, so
+        that nothing which it contradicts is forgotten.
+        """
         assert self._save is not None
         try:
             updated = self._updated(saved, is_found)
