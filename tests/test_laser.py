@@ -135,6 +135,21 @@ def test_sweep_older_than_its_observation_is_matched_where_it_was_made():
     assert errors(np.vstack([path[:1], ahead]), trackings[::2])[:, 0].max() < 0.012
 
 
+def test_sweep_that_comes_after_newer_observations_is_matched_where_it_was_made():
+    """A camera sets the pace, at 30 Hz; a scan, of every third image, is 0.12 s old."""
+    fine = loop_path(480)
+    observations = drive(room(), fine, odometry=fine, rng=np.random.default_rng(5))
+    given = []
+    for index, now in enumerate(observations):
+        stamp_ns = index * 33_000_000
+        scan = observations[index - 4].scan if index % 3 == 0 and index >= 4 else None
+        scan = scan and replace(scan, stamp_ns=stamp_ns - 4 * 33_000_000)
+        given.append(replace(now, stamp_ns=stamp_ns, scan=scan))
+    module = active()
+    off_m = errors(fine, [module.track(observation) for observation in given])[:, 0]
+    assert off_m.max() < 0.012
+
+
 def test_observations_between_scans_are_predicted():
     path = loop_path(300)
     observations = drive(room(), path, odometry=path, rng=np.random.default_rng(6))

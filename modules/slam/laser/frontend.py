@@ -31,6 +31,7 @@ from .matcher import Match, Matcher, novelty
 from .prior import MotionPrior, difference, is_apart
 from .relocalizer import ScanRelocalizer
 from .surface import ScanSurfaceReader, SurfacePoints
+from .trail import Trail
 
 _OVERLAP_MIN_RATIO = 0.5  # with less, the map does not cover this place yet
 _FAILURES_MAX = 10  # consecutive failed matches before mapping continues from dead reckoning
@@ -65,6 +66,7 @@ class FrontEnd:
     _failures: int = field(default=0, init=False)
     _field: LikelihoodField | None = field(default=None, init=False)
     _doubt: Doubt = field(default_factory=Doubt, init=False)
+    _trail: Trail = field(default_factory=Trail, init=False)
 
     def track(self, observation: Observation, scan: LaserScan | None) -> Tracking:
         """Return the pose at the observation, corrected by its scan if it has one."""
@@ -76,11 +78,13 @@ class FrontEnd:
         noise = planar_covariance(motion.covariance)
         self._covariance = propagate(known, before, T_prev_curr, noise)
         surfaces = self._read(scan)
+        begin = before if scan is None else compose(before, self._trail.back_to(scan.stamp_ns))
+        self._trail.add(observation.stamp_ns, T_prev_curr)
         if scan is None or surfaces is None:
             return self._predict(observation, predicted, motion)
         # The scan may be older than the observation: match at the robot's pose then.
         ratio = _share(scan.stamp_ns, before_ns, observation.stamp_ns)
-        predicted_then = compose(before, ratio * T_prev_curr)
+        predicted_then = compose(begin, ratio * T_prev_curr)
         T_then_now = between(predicted_then, predicted)
         if self._field is None:
             self._extend(predicted_then, scan, surfaces)
@@ -89,7 +93,7 @@ class FrontEnd:
         if self.matcher.misfit == 0.0 or is_first:
             self._fit_ns = before_ns
         motion = motion.since_misfit(self.matcher.misfit, self._since_fit_s(observation))
-        priors = [self._prior(known, before, ratio, one) for one in (motion, *motion.alternatives)]
+        priors = [self._prior(known, begin, ratio, one) for one in (motion, *motion.alternatives)]
         is_known = motion.is_measured and not motion.is_doubted
         new = novelty(between(self._seen_pose, predicted_then)) if is_known else 1.0
         match = self.matcher.match(surfaces, self._field, priors, novelty=new)
@@ -289,7 +293,7 @@ def _is_better(match: Match, other: Match) -> bool:
 
 
 def _share(stamp_ns: int, before_ns: int | None, now_ns: int) -> float:
-    """Return the position of a stamp between the last observation (0) and this one (1)."""
+    """Return the position of a stamp between the last observation (0, or before) and this one."""
     if before_ns is None or now_ns <= before_ns:
         return 1.0
     return float(np.clip((stamp_ns - before_ns) / (now_ns - before_ns), 0.0, 1.0))
