@@ -120,6 +120,15 @@ def test_space_is_free_where_beams_passed_around_it(hangs):
         assert free.contains(np.array(list(expected))).tolist() == list(expected.values())
 
 
+@pytest.mark.parametrize("beams", [361, 1441, 3601])
+def test_a_thing_near_a_fine_laser_is_not_free(beams):
+    walls = np.concatenate([box(6, -9, 6.5, 9), box(0.5, -0.025, 0.55, 0.025)])
+    rng = np.random.default_rng(0)
+    scan = scan_at(walls, se3.identity(), stamp_ns=0, rng=rng, beams=beams, fov_rad=np.pi)
+    free = FreeSpace([scan], [np.zeros(3)], se3.identity(), 10.0)
+    assert free.contains(np.array([[0.5, 0.0], [0.5, 0.3]])).tolist() == [False, True]
+
+
 def test_what_was_not_seen_before_is_no_evidence_against_a_motion():
     """A robot that looks ahead moves back, so that more and more of its walls are new."""
     walls = np.concatenate([box(-20, -1, 40, 1), box(3, -1, 3.5, -0.3), box(5, 0.6, 5.5, 1)])

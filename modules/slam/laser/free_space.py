@@ -12,7 +12,6 @@ from sceneslam.types.planar import Planar, rotation
 from sceneslam.types.se3 import Transform
 
 _MARGIN_M = 0.2  # around a point that is free, of poses, beams, and walls seen at a flat angle
-_LEVELS = 6  # up to 2^5 beams pass a point within the margin
 
 
 class FreeSpace:
@@ -53,7 +52,7 @@ class FreeSpace:
         half = _MARGIN_M / np.maximum(distance, _MARGIN_M) / abs(self._step_rad)
         first = np.floor(beam - half).astype(np.int64)
         count = np.ceil(beam + half).astype(np.int64) - first + 1
-        level = np.minimum(np.log2(count).astype(np.int64), _LEVELS - 1)
+        level = np.minimum(np.log2(count).astype(np.int64), len(self._least) - 1)
         row, last = np.arange(len(away))[:, None], self._least.shape[2] - 1
         ends = (first, first + count - (1 << level))
         least = [
@@ -70,7 +69,7 @@ def _beams(scan: LaserScan) -> tuple[int, float, float]:
 def _least(ranges: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the least (L, K, N) of the 2^l ranges (K, N) from each beam on, 0 past the last."""
     levels = [ranges]
-    for level in range(1, _LEVELS):
+    for level in range(1, int(np.log2(max(ranges.shape[1], 1))) + 1):
         before, half = levels[-1], 1 << (level - 1)
         after = np.zeros_like(before)
         after[:, :-half] = before[:, half:]
