@@ -22,6 +22,7 @@ from sceneslam.modules.slam.process.client import LOST, TRACKING
 from sceneslam.modules.slam.ros2_node.client import NodeClient
 from sceneslam.modules.slam.ros2_node.listener import NodeListener, moved
 from sceneslam.modules.slam.ros2_node.module import NodeTopics, Ros2Node
+from sceneslam.ros.encode import Encoder
 from sceneslam.ros.encode_results import ResultEncoder
 from sceneslam.ros.transport.transport import Arrival, Network
 from sceneslam.testing import RIG, room_observation
@@ -133,6 +134,46 @@ def test_local_is_where_the_node_first_knows_the_pose(deviation_m):
     found, statuses = answered({1: (nowhere, deviation_m), 2: (T_world_base, 0.1)})
     assert statuses == [LOST, TRACKING]
     np.testing.assert_allclose(found[2], np.eye(4), atol=1e-12)
+
+
+class TfNode:
+    """A client whose node publishes map -> odom without DDS, and whose robot is 50 m from odom."""
+
+    T_odom_base = se3.from_xy_yaw(50.0, 0.0, 0.3)
+
+    def __init__(self, **settings):
+        self._heard, self._index = {}, 0
+        transport = SimpleNamespace(
+            subscribe=lambda topic, kind, hear, qos: self._heard.update({topic: hear}),
+            publisher=lambda *topic: SimpleNamespace(publish=lambda cdr: None),
+        )
+        topics = dict.fromkeys((*NONE, "odometry", "pose"))
+        kinds = {"pose_kind": "tf", "map_kind": "grid", "needs": ["odometry"], "topics": topics}
+        values = {"deviation_max_m": 1.0, "closes_loops": True, **kinds, **settings}
+        self._client = NodeClient(values)
+        self._client._transport, self._client._camera = transport, None
+        self._client._T_frame_base = np.eye(4)
+        self._client._heard = NodeListener(transport, values)
+
+    def publish(self, T_map_odom):
+        cdr = Encoder().transforms(0, "map", {"odom": T_map_odom})
+        self._heard["/tf"](Arrival(topic="/tf", cdr=cdr, arrived_ns=0))
+
+    def track(self):
+        self._index += 1
+        observation = {"stamp_ns": np.array(self._index), "T_odom_base": self.T_odom_base}
+        return self._client.track(observation)
+
+
+@pytest.mark.parametrize(("closes_loops", "counted"), [(True, [0, 0, 1, 1, 2]), (False, [0] * 5)])
+def test_a_jump_of_map_to_odom_is_a_revision_of_a_node_that_closes_loops(closes_loops, counted):
+    node, found = TfNode(closes_loops=closes_loops), []
+    for x_m, yaw_deg in ((0.0, 0.0), (0.05, 0.0), (0.85, 0.0), (0.85, 0.5), (0.85, 3.5)):
+        T_turn = se3.from_xy_yaw(0.0, 0.0, np.radians(yaw_deg))  # about the robot, not about odom
+        T_map_base = se3.from_xy_yaw(x_m, 0.0, 0.0) @ node.T_odom_base @ T_turn
+        node.publish(T_map_base @ se3.inverse(node.T_odom_base))
+        found.append(int(node.track()["revision"]))
+    assert found == counted
 
 
 def test_a_node_that_ends_ends_the_session_with_a_sentence():

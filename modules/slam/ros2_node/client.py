@@ -33,6 +33,9 @@ _TYPES = {
     "imu": "sensor_msgs/msg/Imu",
 }
 _KEPT = 1000  # stored observations without a pose
+# A larger move of the pose from one observation to the next is a loop closure. Less is within the
+# bounds of the bus's gate: 0.09 m and 3 degrees.
+_JUMP_M, _JUMP_RAD = 0.08, np.radians(2.0)
 
 
 class NodeClient:
@@ -47,6 +50,8 @@ class NodeClient:
         self._T_odom_first: Transform | None = None
         self._T_local_world: Transform | None = None
         self._given_ns: int | None = None  # stamp of the newest returned pose
+        self._T_map_odom: Transform | None = None  # the last that was used
+        self._revision = 0
 
     def activate(self, rig: Fields) -> None:
         """Join the domain and start the node; its standard output is its log."""
@@ -93,6 +98,7 @@ class NodeClient:
             T_map_odom = self._heard.T_map_odom
             if T_map_odom is None or T_odom_base is None:
                 return poses([], [])
+            self._note_jump(T_map_odom, T_odom_base)
             said = {stamp_ns: (T_map_odom @ T_odom_base, 0.0)}
         else:
             said = self._heard.wait(stamp_ns, self._settings["answer_s"])
@@ -126,7 +132,16 @@ class NodeClient:
             found.append(se3.orthonormal(T_local_world @ T_world_base))
             statuses.append(LOST if is_lost else TRACKING)
             self._given_ns = stamp_ns
-        return {**poses(stamps_ns, found), "status": np.array(statuses, np.int64)}
+        status = np.array(statuses, np.int64)
+        return {**poses(stamps_ns, found), "status": status, "revision": self._revision}
+
+    def _note_jump(self, T_map_odom: Transform, T_odom_base: Transform) -> None:
+        """Count a revision where map -> odom moved the robot's pose by more than a jump."""
+        T_map_odom_old, self._T_map_odom = self._T_map_odom, T_map_odom
+        if T_map_odom_old is None or not self._settings["closes_loops"]:
+            return
+        T_old_new = se3.inverse(T_map_odom_old @ T_odom_base) @ T_map_odom @ T_odom_base
+        self._revision += not se3.is_within(T_old_new, _JUMP_M, _JUMP_RAD)
 
     def _since_first(self, stamp_ns: int) -> Transform:
         """Return the motion by odometry since the first observation, identity without odometry."""

@@ -50,6 +50,7 @@ class Ros2Node(ProcessSlam):
 
     `pose_kind` is the type of `topics.pose`: `odometry` (Odometry) or `pose` (PoseStamped) of
     base_link, or `tf`: map -> odom on /tf, multiplied with the odometry that the node receives.
+    With `closes_loops`, a jump of map -> odom is a revision of the past, not a motion.
     """
 
     def __init__(
@@ -98,6 +99,7 @@ class Ros2Node(ProcessSlam):
             "answer_s": answer_s,
             "deviation_max_m": deviation_max_m,
             "network": asdict(network),
+            "closes_loops": closes_loops,
         }
         bridge = python_command("sceneslam.modules.slam.ros2_node.client", settings)
         super().__init__(
