@@ -15,10 +15,12 @@ from sceneslam.atlas.mapper import Mapper
 from sceneslam.atlas.places.floor_plan import join
 from sceneslam.atlas.places.localizer import Fix, LocalizationEvent
 from sceneslam.atlas.submaps.collector import Known
-from sceneslam.atlas.submaps.graph import LOADED
+from sceneslam.atlas.submaps.graph import LOADED, solve
 from sceneslam.experiments.one_map.drive import RIG
 from sceneslam.graphs.edge import EdgeKind
+from sceneslam.maps.inspect import flaws
 from sceneslam.types import planar, se3
+from sceneslam.types.covariance import unknown_motion
 from sceneslam.types.observation import LaserScan, Observation
 from sceneslam.types.rig import Camera, Rig, Sensor
 
@@ -252,6 +254,33 @@ def test_a_map_is_saved_as_the_graph_moved_it_with_the_loops_that_modules_closed
     )
     np.testing.assert_array_equal(saved.T_map_node[0], ASIDE)
     assert saved.edges[-1] == own_loops[0] and len(saved.edges) == len(saved.submaps) - 1
+
+
+def test_a_gap_that_loops_bridge_is_saved_without_the_guess_that_the_robot_stood_still(
+    monkeypatch,
+):
+    Searched(monkeypatch)
+    own, _, observe = looking(speed_m_s=1.0)
+    for second in range(20):
+        observe(second)
+    chain = own._collector.chain
+    seam = chain.motions[1]
+    covariance = seam.covariance + unknown_motion(1.0)
+    chain.motions[1] = replace(seam, covariance=covariance, kind=EdgeKind.HANDOVER)
+    carried = planar.to_transform(np.array([0.0, 40.0, np.pi / 2]))
+    nodes = np.array([*chain.T_run_node[:2], *(carried @ T for T in chain.T_run_node[2:])])
+    loops = [
+        replace(edge(a, b, kind=EdgeKind.LOOP), T_first_second=se3.inverse(nodes[a]) @ nodes[b])
+        for a, b in ((0, 4), (1, 5))
+    ]
+    found = tuple(loop.shifted(1) for loop in loops)
+    own._solved, own._is_over = replace(own._solved, T_map_node=nodes, loops=found), True
+    saved = own.saved()
+    assert (saved.pieces[1:] == 1).all() and flaws(saved) == []
+    moving = saved.moving(saved.nodes(1))
+    held = {"fixed": moving.fixed, "loose": moving.loose}
+    solved = solve(saved.T_map_node, moving.motions, (), places=moving.loops, **held)
+    np.testing.assert_allclose(solved.T_map_node, saved.T_map_node, atol=0.01)
 
 
 def test_a_submap_stays_where_the_run_was_located_then(monkeypatch):

@@ -246,7 +246,7 @@ class Mapper:
             pieces=np.concatenate([self._loaded.pieces, self._own_pieces(loops)]),
             edges=(
                 *self._loaded.edges,
-                *(edge.shifted(count) for edge in own.motions),
+                *(edge.shifted(count) for edge in own.ties),
                 *loops,
             ),
         )
