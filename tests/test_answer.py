@@ -11,15 +11,22 @@ from sceneslam.evaluation.report.answer import answer
 from sceneslam.types.rig import Sensor
 
 
-def told(source=(), **changes):
+def told(source=(), first_pose_s=0.0, **changes):
     metrics = evaluate(switched_run(), true_loop(), settings=SETTINGS)
-    return answer(metrics | changes, [], source)
+    return answer(metrics | changes, [], source, first_pose_s=first_pose_s)
 
 
 def test_a_good_run_is_told_in_one_sentence():
     found = told()
     assert found.kind == "worked" and not found.where and not found.advice
-    assert found.headline.startswith("It worked: 100.0 % of the observations")
+    share = "It worked: from the first pose on, 100.0 % of the observations have a pose"
+    assert found.headline.startswith(share)
+
+
+def test_a_first_pose_that_came_late_is_in_the_headline():
+    late, early = (told(first_pose_s=at_s).headline for at_s in (15.0, 0.9))  # of 19.9 s
+    assert "from the first pose on (at 15.0 of 19.9 s), 100.0 % of" in late
+    assert "from the first pose on, 100.0 % of" in early
 
 
 @pytest.mark.parametrize(
@@ -66,7 +73,7 @@ def test_few_bridged_poses_ask_for_no_change():
 
 def test_a_run_without_a_pose_did_not_work():
     metrics = evaluate(poseless_run(observed=10), None, settings=SETTINGS)
-    found = answer(metrics, ["the source ended early"], ())
+    found = answer(metrics, ["the source ended early"], (), first_pose_s=0.0)
     assert found.kind == "failed" and found.where == ["the source ended early"]
 
 

@@ -18,6 +18,7 @@ from evaluation_runs import (
     switched_run,
     timings,
     true_loop,
+    without,
 )
 from matplotlib.figure import Figure
 
@@ -244,6 +245,12 @@ def test_report_tells_over_which_time_the_motion_is_compared(tmp_path):
     shown = _numbers(metrics)
     assert "error of the motion over 2.5 s" in shown and "error over 2.5 s" in shown
     assert "over 1 s" not in shown
+
+
+def test_report_of_a_run_whose_first_pose_came_late_says_so(tmp_path):
+    html = report(tmp_path, without(switched_run(), slice(0, 15)), None)
+    assert "from the first pose on (at 1.5 of 19.9 s), 100.0 % of the observations" in html
+    assert "of observations from the first pose on with a pose" in html
 
 
 def test_report_tells_how_many_observations_were_dropped(tmp_path):

@@ -12,6 +12,7 @@ from sceneslam.evaluation.report.summary import number, percent
 
 _SHARE = 0.01  # of the observations: a smaller share gives no advice
 _CORRECT = 0.99  # of the time
+_LATE = 0.05  # of the duration: a later first pose is in the headline
 _ADVICE = (  # part of the reason for a missing pose -> advice
     (
         r"while (.+) was lost",
@@ -51,10 +52,17 @@ class Answer:
     advice: Sequence[str]  # what to change
 
 
-def answer(metrics: Metrics, faults: Sequence[str], source: Collection[str]) -> Answer:
+def answer(
+    metrics: Metrics,
+    faults: Sequence[str],
+    source: Collection[str],
+    *,
+    first_pose_s: float,
+) -> Answer:
     """Return whether a run worked.
 
     `faults` are errors of the input, or why the run ended early; `source` the keys of the source.
+    `first_pose_s` counts from the first observation.
     """
     where = list(dict.fromkeys([*faults, *metrics["shortfalls"]]))
     advice = [*dict.fromkeys(_advice(metrics, source))]
@@ -70,7 +78,10 @@ def answer(metrics: Metrics, faults: Sequence[str], source: Collection[str]) -> 
         where.append(f"{false} changes of module followed a wrong scene.")
     if where:
         return Answer(kind="partly", headline="It worked in part.", where=where, advice=advice)
-    summary = f"{percent(metrics['coverage'])} of the observations have a pose"
+    late = first_pose_s > _LATE * metrics["duration_s"]
+    at = f" (at {first_pose_s:.1f} of {metrics['duration_s']:.1f} s)" if late else ""
+    share = percent(metrics["coverage"])
+    summary = f"from the first pose on{at}, {share} of the observations have a pose"
     if metrics["ate_rmse_m"] is not None:
         summary += f", {number(metrics['ate_rmse_m'], 3, ' m')} off (root mean square)"
     return Answer(kind="worked", headline=f"It worked: {summary}.", where=[], advice=advice)

@@ -80,7 +80,7 @@ def write_report(
     entries = chronicle(result, metrics["switches"], value_label=value_label)
     values = {
         **_told(metrics),
-        "answer": _answer(answer(metrics, faults, config.get("source") or ())),
+        "answer": _answer(_answered(result, metrics, faults, config)),
         "title": escape(_titled(title, config)),
         "made_of": markup.bullets(_made_of(config)),
         "faults": _faults(_amiss(metrics)),
@@ -92,6 +92,14 @@ def write_report(
         "config": escape(config_yaml),
     }
     return fill_page(folder / "report.html", "sceneslam.evaluation.report", "run_page.html", values)
+
+
+def _answered(
+    result: RunResult, metrics: Metrics, faults: Sequence[str], config: Mapping[str, Any]
+) -> Answer:
+    stamps_ns = result.trajectory.stamps_ns
+    first_pose_s = seconds(metrics, int(stamps_ns[0])) if len(stamps_ns) else 0.0
+    return answer(metrics, faults, config.get("source") or (), first_pose_s=first_pose_s)
 
 
 def _seen(result: RunResult) -> str:
@@ -167,7 +175,7 @@ def _numbers(metrics: Metrics) -> str:
         f"error of the motion {over}": number(metrics["rpe_trans_m"], 4, " m"),
         f"turn's error {over}": degrees(metrics["rpe_rot_rad"]),
         "of the time correct": percent(metrics["correct_rate"]),
-        "of observations with a pose": percent(metrics["coverage"]),
+        "of observations from the first pose on with a pose": percent(metrics["coverage"]),
         "switches": str(len(metrics["switches"])),
         "false switches": number(metrics["false_switches"], 0),
         "speed, times real time": number(metrics["realtime_factor"], 2, " ×"),
