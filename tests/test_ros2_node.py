@@ -48,6 +48,7 @@ def build(behaviour, **changes):
         "map_kind": "grid",
         "pose_frame": "base",
         "answer_s": 0.5,
+        "tf_age_max_s": 1.0,
         "deviation_max_m": 1.0,
         "network": Network(domain_id=domain_id),
         "late_max_s": 0.5,
@@ -149,7 +150,8 @@ class TfNode:
         )
         topics = dict.fromkeys((*NONE, "odometry", "pose"))
         kinds = {"pose_kind": "tf", "map_kind": "grid", "needs": ["odometry"], "topics": topics}
-        values = {"deviation_max_m": 1.0, "closes_loops": True, **kinds, **settings}
+        values = {"deviation_max_m": 1.0, "closes_loops": True, "tf_age_max_s": 1.0}
+        values |= kinds | settings
         self._client = NodeClient(values)
         self._client._transport, self._client._camera = transport, None
         self._client._T_frame_base = np.eye(4)
@@ -176,6 +178,24 @@ def test_a_jump_of_map_to_odom_is_a_revision_of_a_node_that_closes_loops(closes_
     assert found == counted
 
 
+@pytest.mark.parametrize(("tf_age_max_s", "is_kept"), [(1.0, False), (None, True)])
+def test_a_node_that_stops_publishing_tf_gives_no_poses(monkeypatch, tf_age_max_s, is_kept):
+    clock = SimpleNamespace(now_s=100.0)
+    listener = "sceneslam.modules.slam.ros2_node.listener"
+    monkeypatch.setattr(f"{listener}.monotonic", lambda: clock.now_s)
+    node = TfNode(tf_age_max_s=tf_age_max_s)
+
+    def count(now_s):
+        clock.now_s = now_s
+        return len(node.track()["stamps_ns"])
+
+    assert count(100.0) == 0  # nothing was published
+    node.publish(np.eye(4))
+    assert [count(100.9), count(101.1)] == [1, is_kept]
+    node.publish(np.eye(4))
+    assert count(101.2) == 1
+
+
 def test_a_node_that_ends_ends_the_session_with_a_sentence():
     with active("ends") as module, pytest.raises(ModuleError, match="the node ended"):
         for index in range(300):
@@ -191,6 +211,7 @@ def test_a_node_that_ends_ends_the_session_with_a_sentence():
         ("pose_frame", "laser"),
         ("needs", ["sonar"]),
         ("answer_s", 0.0),
+        ("tf_age_max_s", 0.0),
     ],
 )
 def test_a_setting_that_makes_no_sense_is_named(key, value):

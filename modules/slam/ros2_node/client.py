@@ -95,7 +95,7 @@ class NodeClient:
             del self._sent[next(iter(self._sent))]
         self._send(stamp_ns, observation)
         if self._settings["pose_kind"] == "tf":
-            T_map_odom = self._heard.T_map_odom
+            T_map_odom = self._heard.T_map_odom(self._settings["tf_age_max_s"])
             if T_map_odom is None or T_odom_base is None:
                 return poses([], [])
             self._note_jump(T_map_odom, T_odom_base)

@@ -31,7 +31,7 @@ class NodeListener:
         self._store: Any = get_typestore(Stores.ROS2_HUMBLE)
         self._came = threading.Condition()
         self._poses: dict[int, tuple[Transform, float]] = {}  # stamp -> pose, sigma [m]
-        self.T_map_odom: Transform | None = None
+        self._tf: tuple[float, Transform] | None = None  # when it arrived [s], map -> odom
         self._map: dict[str, NDArray[Any]] = {}
         topics, self._map_kind = settings["topics"], settings["map_kind"]
         if settings["pose_kind"] == "tf":
@@ -52,6 +52,13 @@ class NodeListener:
                 self._came.wait(until_s - monotonic())
             found, self._poses = self._poses, {}
         return found
+
+    def T_map_odom(self, age_max_s: float | None) -> Transform | None:
+        """Return the newest map -> odom (4, 4) [m]; None if it arrived longer ago, or never."""
+        tf = self._tf
+        if tf is None or (age_max_s is not None and monotonic() - tf[0] > age_max_s):
+            return None
+        return tf[1]
 
     def map(self) -> dict[str, NDArray[Any]]:
         """Return the latest map: points (N, 3) [m] or a grid, in the node's map frame."""
@@ -76,7 +83,7 @@ class NodeListener:
         message = self._store.deserialize_cdr(arrival.cdr, "tf2_msgs/msg/TFMessage")
         for one in decode.transforms(message):
             if (one.parent, one.child) == (names.MAP, names.ODOM):
-                self.T_map_odom = one.T_parent_child
+                self._tf = monotonic(), one.T_parent_child
 
     def _hear_map(self, arrival: Arrival) -> None:
         message = self._store.deserialize_cdr(arrival.cdr, _MAP_TYPES[self._map_kind])

@@ -63,6 +63,7 @@ class Ros2Node(ProcessSlam):
         map_kind: str,
         pose_frame: str,
         answer_s: float,
+        tf_age_max_s: float | None,
         deviation_max_m: float,
         network: Network,
         late_max_s: float,
@@ -86,6 +87,8 @@ class Ros2Node(ProcessSlam):
         for name, value in (("answer_s", answer_s), ("deviation_max_m", deviation_max_m)):
             if not 0 < value < np.inf:
                 raise ConfigError(name, value, "above 0")
+        if tf_age_max_s is not None and not 0 < tf_age_max_s < np.inf:
+            raise ConfigError("tf_age_max_s", tf_age_max_s, "null, or above 0")
         sensors = {sensor.value for sensor in Sensor}
         if not needs or not sensors >= set(needs):
             raise ConfigError("needs", list(needs), f"some of {', '.join(sorted(sensors))}")
@@ -97,6 +100,7 @@ class Ros2Node(ProcessSlam):
             "map_kind": map_kind,
             "pose_frame": pose_frame,
             "answer_s": answer_s,
+            "tf_age_max_s": tf_age_max_s,
             "deviation_max_m": deviation_max_m,
             "network": asdict(network),
             "closes_loops": closes_loops,
