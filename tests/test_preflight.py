@@ -53,7 +53,7 @@ def tum(folder, depth_scale=5000.0, camera=CAMERA):
 
 
 def bag(path):
-    return RosBag(str(path), TOPICS, {}, 1000.0, None, None, 0.02, None, None, None)
+    return RosBag(str(path), TOPICS, {}, 1000.0, None, None, 0.02, 1.0, None, None, None)
 
 
 def told(source):

@@ -84,7 +84,8 @@ def test_recordings_of_every_compression_are_read(
 def test_points_come_before_scans_and_truth_is_no_odometry(shared_data: Path) -> None:
     source = make_source("rosbag", shared_data / "bags" / "embag_test.bag")
     assert source.rig.sensors == {Sensor.POINTS, Sensor.SCAN}
-    assert len(list(source)) == 5
+    found = list(source)  # of clocks that do not agree: the laser never sets the pace
+    assert len(found) == 5 and all(one.points_lidar is not None for one in found)
     assert len(source.ground_truth().trajectory) == 5
 
 
@@ -224,6 +225,55 @@ def test_float_depth_without_one_number_is_told(tmp_path: Path) -> None:
     assert [one.depth_m.any() for one in source] == [False, True, False]
     (fault,) = source.faults
     assert "depth image without one finite value: 2 times, first at stamp" in fault
+
+
+def record_gaps(path: Path, seen_s: list[tuple[float, float]], late_ms: int = 0) -> Path:
+    """Write scans for 14 s, and images within the spans `seen_s`, recorded `late_ms` later."""
+    messages: list[tuple[int, str, int]] = []
+    for number in range(140):
+        stamp_ns = STAMP_NS + number * 10**8
+        messages.append((stamp_ns, "/scan", stamp_ns))
+        if any(start_s <= number / 10 < end_s for start_s, end_s in seen_s):
+            messages.append((stamp_ns + (20 + late_ms) * 10**6, "/rgb", stamp_ns + 20_000_000))
+    with Recorder(path) as recorder:
+        add = recorder.add
+        for log_ns, topic, stamp_ns in sorted(messages):
+            recorder.add = lambda name, _, message, at=log_ns: add(name, at, message)  # type: ignore
+            if topic == "/scan":
+                recorder.scan(topic, stamp_ns, [1.0] * 5)
+            else:
+                recorder.image(topic, stamp_ns, COLOR)
+    return path
+
+
+@pytest.mark.parametrize("late_ms", [0, 300])
+@pytest.mark.parametrize(
+    ("seen_s", "scans", "length"),
+    [
+        ([(3, 5), (9, 11)], 140, None),
+        ([(0, 4)], 140, None),
+        ([(10, 14)], 140, None),
+        ([(0, 3), (6, 14)], 140, 110),
+        ([(0, 3), (3.9, 14)], 131, 131),  # too short a gap
+        ([(0, 14)], 140, 140),
+    ],
+)
+def test_while_the_camera_is_silent_the_laser_sets_the_pace(
+    tmp_path: Path,
+    seen_s: list[tuple[float, float]],
+    scans: int,
+    length: int | None,
+    late_ms: int,
+) -> None:
+    source = make_source("mcap", record_gaps(tmp_path / "a.mcap", seen_s, late_ms))
+    found = list(source)
+    stamps_ns = np.array([one.stamp_ns for one in found])
+    assert (np.diff(stamps_ns) > 0).all()
+    images = sum(one.has(Sensor.IMAGE) for one in found)
+    assert images == source.survey().stream(Sensor.IMAGE).count
+    assert len({one.scan.stamp_ns for one in found if one.scan is not None}) == scans
+    assert [source.span.start_ns, source.span.end_ns] == stamps_ns[[0, -1]].tolist()
+    assert source.length == length and source.faults == []
 
 
 def test_camera_info_of_another_size_is_refused(tmp_path: Path) -> None:

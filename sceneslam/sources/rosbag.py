@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
+from functools import cached_property, partial
+from itertools import islice
 from typing import Any
 
 from sceneslam.ros import decode
@@ -11,6 +12,7 @@ from sceneslam.ros.pixels import DepthUnits
 from sceneslam.sources.bag.frames import FrameTree
 from sceneslam.sources.bag.observation import PRIMARY, BundleDecoder, Decoded, measured
 from sceneslam.sources.bag.open_recording import open_recording
+from sceneslam.sources.bag.pace import Pace
 from sceneslam.sources.bag.recording import Message
 from sceneslam.sources.bag.rig import (
     Given,
@@ -29,6 +31,7 @@ from sceneslam.sources.intrinsics import checked_above_zero, given_intrinsics, g
 from sceneslam.sources.prefetch import prefetched
 from sceneslam.sources.spanned import TimeSpan
 from sceneslam.sources.survey.bag_sample import survey_recording
+from sceneslam.sources.survey.preflight import CLOCKS_APART_S
 from sceneslam.sources.survey.survey import Survey
 from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.input_files import given_path
@@ -40,6 +43,7 @@ from sceneslam.types.truth import GroundTruth
 class RosBag:
     """Gives one observation per message of the first of image, depth, points, scan, odometry.
 
+    While that has no message for longer than `silent_after_s`, the next one replaces it.
     `topics` names the topic per sensor (null: found by type and encoding; `none`: not used).
     """
 
@@ -52,12 +56,14 @@ class RosBag:
         depth_range_m: list[float] | None,
         lidar_range_m: list[float] | None,
         sync_tolerance_s: float,
+        silent_after_s: float,
         base_frame: str | None,
         ground_truth_frame: str | None,
         wheels: Mapping[str, float] | None,
     ) -> None:
         checked_above_zero("depth_scale", depth_scale)
         checked_above_zero("sync_tolerance_s", sync_tolerance_s)
+        checked_above_zero("silent_after_s", silent_after_s)
         if ground_truth_frame not in (None, CAMERA, BASE):
             raise ConfigError("ground_truth_frame", ground_truth_frame, "null, camera or base")
         given = Given(
@@ -69,6 +75,7 @@ class RosBag:
         self._path = given_path(path)
         self._depth_scale = depth_scale
         self._sync_tolerance_s = sync_tolerance_s
+        self._silent_after_s = silent_after_s
         self._truth_frame = ground_truth_frame
         self._faults = FaultLog()
         self._recording = open_recording(self._path)
@@ -89,7 +96,12 @@ class RosBag:
 
     @property
     def length(self) -> int | None:
-        """Return the number of messages of the primary topic."""
+        """Return the number of messages of the primary topic.
+
+        None if another topic sets the pace at the beginning or the end.
+        """
+        if any(sensor is not self._primary for sensor in self._paces()):
+            return None
         return self._recording.topics[self._by_sensor[self._primary]].count
 
     @property
@@ -101,13 +113,13 @@ class RosBag:
 
     @property
     def span(self) -> TimeSpan | None:
-        """Return the first and last stamp of the primary topic."""
-        topic = self._by_sensor[self._primary]
-        first = next(self._recording.messages({topic}), None)
-        last = self._recording.last(topic)
-        if first is None or last is None:
+        """Return the first and last stamp of the topics that set the pace there."""
+        if not self._firsts or not self._lasts:
             return None
-        return TimeSpan(start_ns=self._stamp_ns(first), end_ns=self._stamp_ns(last))
+        begin, end = self._paces()
+        return TimeSpan(
+            start_ns=self._stamp_ns(self._firsts[begin]), end_ns=self._stamp_ns(self._lasts[end])
+        )
 
     def __iter__(self) -> Iterator[Observation]:
         """Yield observations; decodes pixels ahead in threads."""
@@ -148,19 +160,65 @@ class RosBag:
         units = DepthUnits(self._depth_scale, depth_range_m)
         is_seeing = bool(self._topics.image or self._topics.depth)
         size_wh = picture_size_wh(self._recording, self._topics) if is_seeing else None
-        decoder = BundleDecoder(self._primary, self._rig.sensors, size_wh, units)
-        for bundle in self._bundles():
-            yield partial(decoder.observe, bundle)
+        decoders = {
+            sensor: BundleDecoder(sensor, self._rig.sensors, size_wh, units) for sensor in PRIMARY
+        }
+        for bundle, primary in self._bundles():
+            yield partial(decoders[primary].observe, bundle)
 
-    def _bundles(self) -> Iterator[SynchronisedSamples]:
-        topics = frozenset(self._by_sensor.values())
-        synchroniser = Synchroniser(
-            self._primary, frozenset(self._by_sensor), self._sync_tolerance_s
-        )
+    def _bundles(self) -> Iterator[tuple[SynchronisedSamples, Sensor]]:
+        """Yield synchronised samples, each with its primary sensor."""
+        topics, primary = frozenset(self._by_sensor.values()), self._primary
+        synchroniser = Synchroniser(primary, frozenset(self._by_sensor), self._sync_tolerance_s)
+        begin_ns = min((one.log_ns for one in self._firsts.values()), default=0)
+        paced = {one: self._by_sensor[one] for one in (self._primary, *self._firsts)}
+        pace = Pace(paced, self._silent_after_s, begin_ns)
         for message in self._recording.messages(topics):
-            for sensor, sample in self._samples(message):
-                yield from synchroniser.add(sensor, sample)
-        yield from synchroniser.flush()
+            samples = list(self._samples(message))
+            pace.look(message.log_ns)
+            if samples:
+                pace.hear(message.topic, message.log_ns)
+            if samples and pace.sensor is not primary:
+                handed = synchroniser.hand_over(pace.sensor, samples[0][1].stamp_ns)
+                yield from ((one, primary) for one in handed)
+                primary = pace.sensor
+            for sensor, sample in samples:
+                yield from ((one, primary) for one in synchroniser.add(sensor, sample))
+        yield from ((one, primary) for one in synchroniser.flush())
+
+    @cached_property
+    def _firsts(self) -> Mapping[Sensor, Message]:
+        """Return the first message of each sensor that can set the pace, by rank.
+
+        It can if its clock agrees with that of the primary sensor: observations have rising stamps.
+        """
+        found, delays_ns = {}, {}
+        for sensor in (one for one in PRIMARY if one in self._by_sensor):
+            message = next(self._recording.messages({self._by_sensor[sensor]}), None)
+            if message is not None:
+                found[sensor] = message
+                delays_ns[sensor] = message.log_ns - self._stamp_ns(message)
+        own_ns, apart_ns = delays_ns.get(self._primary), CLOCKS_APART_S * 1e9
+        return {
+            sensor: message
+            for sensor, message in found.items()
+            if own_ns is None or abs(delays_ns[sensor] - own_ns) <= apart_ns
+        }
+
+    @cached_property
+    def _lasts(self) -> Mapping[Sensor, Message]:
+        """Return the last message of each of the same sensors."""
+        found = {one: self._recording.last(self._by_sensor[one]) for one in self._firsts}
+        return {sensor: one for sensor, one in found.items() if one is not None}
+
+    def _paces(self) -> Iterator[Sensor]:
+        """Yield the sensors that set the pace at the beginning and at the end, if there are any."""
+        begin_ns = min((one.log_ns for one in self._firsts.values()), default=0)
+        end_ns = max((one.log_ns for one in self._lasts.values()), default=0)
+        for ends, at_ns in ((self._firsts, begin_ns), (self._lasts, end_ns)):
+            near_ns = self._silent_after_s * 1e9
+            near = (sensor for sensor in ends if abs(ends[sensor].log_ns - at_ns) <= near_ns)
+            yield from islice(near, 1)
 
     def _samples(self, message: Message) -> Iterator[tuple[Sensor, Sample]]:
         """Yield a message's samples; for an invalid message, none, and count a fault."""

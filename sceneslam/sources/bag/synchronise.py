@@ -72,6 +72,7 @@ class Synchroniser:
         self._seen_ns: dict[Sensor, int] = {}  # the latest stamp of each stream
         self._arrived_ns = 0  # the latest arrival
         self._taken_ns: dict[Sensor, int] = {}  # the newest sample used in a set
+        self._given_ns = -(2**63)  # the stamp of the last set
         self._passed: Sample | None = None  # the odometry before the oldest queued one
 
     def add(self, sensor: Sensor, sample: Sample) -> Iterator[SynchronisedSamples]:
@@ -90,6 +91,18 @@ class Synchroniser:
             self._held.pop(primary, None)
             self._primary = primary
             self._waiting.clear()
+
+    def hand_over(self, primary: Sensor, until_ns: int) -> Iterator[SynchronisedSamples]:
+        """Use another primary sensor from now on; yield the waiting sets before `until_ns`.
+
+        Queued samples of the new primary sensor become primary, those of the old one are queued.
+        """
+        while self._waiting and self._waiting[0].stamp_ns < until_ns:
+            yield self._bundle(self._waiting.popleft())
+        queued = self._held.pop(primary)
+        self._held[self._primary] = deque(self._waiting, maxlen=_MOST_HELD)
+        self._primary = primary
+        self._waiting = deque(one for one in queued if one.stamp_ns > self._given_ns)
 
     def flush(self) -> Iterator[SynchronisedSamples]:
         """Yield the remaining sets at the end of the recording."""
@@ -112,7 +125,7 @@ class Synchroniser:
         return True
 
     def _bundle(self, primary: Sample) -> SynchronisedSamples:
-        stamp_ns = primary.stamp_ns
+        stamp_ns = self._given_ns = primary.stamp_ns
         return SynchronisedSamples(
             primary=primary,
             depth=self._nearest(Sensor.DEPTH, stamp_ns),

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
 from statistics import median
 
-from sceneslam.sources.bag.observation import PRIMARY
+from sceneslam.sources.bag.pace import Pace
 from sceneslam.sources.live.clock import Lined, StampOrder
 from sceneslam.types.rig import Sensor
 from sceneslam.types.run import Event
@@ -27,8 +27,7 @@ class Streams:
     def __init__(self, topics: Mapping[Sensor, str], silent_after_s: float, now_ns: int) -> None:
         self._topics = topics
         self._silent_ns = round(silent_after_s * 1e9)
-        self._heard_ns = dict.fromkeys(topics.values(), now_ns)
-        self._silent: set[str] = set()
+        self._pace = Pace(topics, silent_after_s, now_ns)
         self._first_ns: dict[str, int] = {}
         self._told_ns: dict[tuple[str, str], int] = {}
         self._followed: dict[str, int] = {}  # topic -> used publisher
@@ -42,9 +41,7 @@ class Streams:
     @property
     def pace(self) -> Sensor:
         """Return the sensor that sets the pace of observations: the first that is alive."""
-        ranked = [sensor for sensor in PRIMARY if sensor in self._topics]
-        alive = [sensor for sensor in ranked if self._topics[sensor] not in self._silent]
-        return (alive or ranked)[0]
+        return self._pace.sensor
 
     @property
     def waits_for(self) -> frozenset[Sensor]:
@@ -52,7 +49,7 @@ class Streams:
         return frozenset(
             sensor
             for sensor, topic in self._topics.items()
-            if sensor in _WAITED_FOR and topic not in self._silent
+            if sensor in _WAITED_FOR and not self._pace.is_silent(topic)
         )
 
     def has_begun(self, stamp_ns: int) -> bool:
@@ -63,7 +60,7 @@ class Streams:
         for sensor, topic in self._topics.items():
             first_ns = self._first_ns.get(topic)
             if first_ns is None:
-                if topic not in self._silent:
+                if not self._pace.is_silent(topic):
                     return False
             elif sensor in _WAITED_FOR and first_ns > stamp_ns:
                 return False
@@ -98,10 +95,8 @@ class Streams:
 
     def hear(self, topic: str, lined: Lined, arrived_ns: int) -> None:
         """Record the arrival of a message."""
-        self._heard_ns[topic] = arrived_ns
         self._first_ns.setdefault(topic, lined.stamp_ns)
-        if topic in self._silent:
-            self._silent.discard(topic)
+        if self._pace.hear(topic, arrived_ns):
             self.tell("stream_returned", lined.stamp_ns, topic=topic)
         if lined.order is StampOrder.JUMPED:
             before_ns = self._shifts_ns.get(topic, 0)
@@ -120,13 +115,8 @@ class Streams:
 
     def look(self, now_ns: int, stamp_ns: int) -> bool:
         """Detect silent streams; return whether there is a new one."""
-        fallen = [
-            topic
-            for topic, heard_ns in self._heard_ns.items()
-            if topic not in self._silent and now_ns - heard_ns > self._silent_ns
-        ]
+        fallen = self._pace.look(now_ns)
         for topic in fallen:
-            self._silent.add(topic)
             self.tell("stream_silent", stamp_ns, topic=topic, for_s=self._silent_ns / 1e9)
         return bool(fallen)
 

@@ -142,6 +142,7 @@ class Simulator:
                 depth_range_m=None,
                 lidar_range_m=None,
                 sync_tolerance_s=0.002,
+                silent_after_s=1.0,
                 base_frame=None,
                 ground_truth_frame=None,
                 wheels=None,

@@ -24,7 +24,7 @@ _FIELD_OF_VIEW_DEG = (15.0, 150.0)  # of a pinhole camera, horizontal
 _OFF_CENTRE = 0.25  # of the image's size; a principal point is within some per cent of the centre
 _TURN_MAX_RADPS = 35.0  # gyros measure up to 2000 degrees per second
 _RETURNS_MIN = 0.02  # share of beams with a return; less in open fields only
-_CLOCKS_APART_S = 1.0  # drivers deliver earlier; TAI, which PTP has, is 37 s ahead of UTC
+CLOCKS_APART_S = 1.0  # drivers deliver earlier; TAI, which PTP has, is 37 s ahead of UTC
 _IMAGE_RATE_HZ = (0.5, 2000.0)  # below, images do not overlap; above, the stamps' unit is wrong
 
 
@@ -99,7 +99,7 @@ def _of_time(survey: Survey) -> Iterator[str]:
             yield f"{stream.place} and {primary.place} have no time in common: {_spans(survey)}"
         elif stream.delay_s is not None and primary.delay_s is not None:
             ahead_s = primary.delay_s - stream.delay_s
-            if abs(ahead_s) > _CLOCKS_APART_S:
+            if abs(ahead_s) > CLOCKS_APART_S:
                 yield (
                     f"the stamps of {stream.place} are {abs(ahead_s):.1f} s "
                     f"{'ahead of' if ahead_s > 0 else 'behind'} those of {primary.place}, judged "
