@@ -71,6 +71,7 @@ SWITCH_KEYS = {
     "gap_s",
     "jump_m",
     "jump_rad",
+    "jump_is_error",
     "cost_ms",
     "first_pose_ms",
     "catch_up_s",

@@ -19,6 +19,7 @@ from evaluation_runs import (
 
 from sceneslam.evaluation.metrics import evaluate
 from sceneslam.evaluation.report.chronicle import chronicle
+from sceneslam.evaluation.report.run_page import _switches
 from sceneslam.evaluation.report.story import tell
 from sceneslam.evaluation.report.summary import summary_lines
 from sceneslam.types import se3
@@ -36,7 +37,29 @@ def switched_back(at: int, to: str = "rgbd") -> RunResult:
 def test_without_truth_the_jump_is_what_the_handover_measured():
     (switch,) = evaluate(switched_run(), None, settings=SETTINGS)["switches"]
     assert (switch["jump_m"], switch["jump_rad"], switch["cost_ms"]) == (0.5, 0.25, 3.5)
-    assert switch["gap_s"] == 0.0
+    assert switch["gap_s"] == 0.0 and not switch["jump_is_error"]
+
+
+def test_without_truth_the_jump_is_told_as_a_motion_of_the_pose_and_not_as_an_error():
+    metrics = evaluate(switched_run(), None, settings=SETTINGS)
+    story, (line,) = " ".join(tell(metrics)), [x for x in summary_lines(metrics) if "->" in x]
+    assert (
+        "; the current pose was moved by 0.500 m and 14.32°, and the trajectory has no gap" in story
+    )
+    assert "moved by 0.500 m and 14.32°, gap" in line and "off by" not in story
+    assert "<td>moved 0.5000 m</td><td>moved 14.32°</td>" in _switches(metrics)
+    details = chronicle(switched_run(), metrics["switches"], value_label="")[-1].details
+    assert "No gap." in details and "Error" not in " ".join(details)
+
+
+def test_without_truth_a_pose_that_was_not_moved_has_no_jump():
+    run = switched_run()
+    still = {"jump_m": 0.0, "jump_rad": 0.0}
+    events = [e | still if e["event"] == "handover" else e for e in run.events]
+    metrics = evaluate(replace(run, events=events), None, settings=SETTINGS)
+    told = " ".join([*tell(metrics), *summary_lines(metrics), _switches(metrics)])
+    assert "; the trajectory has no gap." in told and "<td>–</td><td>–</td>" in told
+    assert not any(text in told for text in ("0.000", "moved by", "off by"))
 
 
 def test_jump_is_the_error_of_the_motion_across_the_seam():
@@ -44,6 +67,7 @@ def test_jump_is_the_error_of_the_motion_across_the_seam():
     (switch,) = evaluate(run, true_loop(), settings=SETTINGS)["switches"]
     assert switch["jump_m"] == pytest.approx(0.3, abs=0.005)
     assert switch["jump_rad"] == pytest.approx(0.0, abs=1e-6)
+    assert switch["jump_is_error"]
 
 
 def test_seam_of_a_rewind_lies_where_the_new_poses_begin():

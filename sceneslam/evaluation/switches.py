@@ -31,10 +31,10 @@ def list_switches(
     """Return one entry for every decision that replaced a module, for `metrics.json`.
 
     `jump_m` and `jump_rad` are the error of the estimated motion across the seam against the true
-    motion, or else the jump that the hand-over measured. None is unknown: a module without a pose
-    before it was replaced has neither jump nor gap. `confirm_delay_s` is the time from the true
-    change that a switch is the first to answer until the new module takes over. `scenes` maps own
-    scenes to the truth's names.
+    motion, if `jump_is_error`; else how far the hand-over moved the current pose, which is no
+    error. None is unknown: a module without a pose before it was replaced has neither jump nor gap.
+    `confirm_delay_s` is the time from the true change that a switch is the first to answer until
+    the new module takes over. `scenes` maps own scenes to the truth's names.
     """
     decisions = [event for event in result.events if is_switch(event)]
     return [_describe(decision, result, truth, scenes) for decision in decisions]
@@ -123,7 +123,8 @@ def _describe(
     handover = _same_stamp(result.events, "handover", decision)
     cost = _same_stamp(result.events, "cost", decision)
     seam = find_seam(result, decision)
-    jump_m, jump_rad = _jump(result, truth, seam, handover) if seam else (None, None)
+    T_error = _motion_error(result, truth, seam) if seam else None
+    jump_m, jump_rad = _jump(T_error, handover) if seam else (None, None)
     return {
         "stamp_ns": int(decision["stamp_ns"]),
         "decided_ns": _decided_ns(decision),
@@ -135,6 +136,7 @@ def _describe(
         "gap_s": _gap_s(result, seam) if seam else None,
         "jump_m": jump_m,
         "jump_rad": jump_rad,
+        "jump_is_error": T_error is not None,
         "cost_ms": cost.get("handover_ms"),
         "first_pose_ms": cost.get("first_pose_ms"),
         "catch_up_s": cost.get("catch_up_s"),
@@ -193,11 +195,8 @@ def _change_in_force(truth: GroundTruth, stamp_ns: int) -> SceneChange | None:
     return changes[-1] if changes else None
 
 
-def _jump(
-    result: RunResult, truth: GroundTruth | None, seam: Seam, handover: Event
-) -> tuple[float | None, float | None]:
-    """Return the error of the motion across the seam: [m] and [rad]."""
-    T_error = _motion_error(result, truth, seam)
+def _jump(T_error: Transform | None, handover: Event) -> tuple[float | None, float | None]:
+    """Return the error of the motion, or else the motion of the current pose: [m] and [rad]."""
     if T_error is None:
         return handover.get("jump_m"), handover.get("jump_rad")
     return float(np.linalg.norm(T_error[:3, 3])), float(se3.rotation_angle_rad(T_error))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from sceneslam.evaluation.report.summary import degrees, number
+from sceneslam.evaluation.report.summary import degrees, jump, number
 from sceneslam.types.run import Event
 
 _HEALTH = {
@@ -76,11 +76,12 @@ def _handover(event: Event, at_once: Sequence[Event], origin_ns: int) -> str:
 
 
 def _effect(switch: Mapping[str, Any]) -> str:
-    if not switch or switch["jump_m"] is None:
+    if not switch or switch["gap_s"] is None:
         return ""
     gap = f"{switch['gap_s']:.2f} s without a pose" if switch["gap_s"] else "no gap"
-    error = f"{number(switch['jump_m'], 4, ' m')} and {degrees(switch['jump_rad'])}"
-    return f"Error of the motion across it: {error}; {gap}."
+    if not switch["jump_is_error"]:  # how far the current pose moved is a sentence of its own
+        return f"{gap[0].upper()}{gap[1:]}."
+    return f"Error of the motion across it: {jump(switch, 4)}; {gap}."
 
 
 def _cost(event: Event) -> str:

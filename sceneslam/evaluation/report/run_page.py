@@ -18,7 +18,7 @@ from sceneslam.evaluation.report.chronicle import Entry, chronicle
 from sceneslam.evaluation.report.moments import pictures
 from sceneslam.evaluation.report.page import fill_page
 from sceneslam.evaluation.report.story import tell
-from sceneslam.evaluation.report.summary import degrees, number, percent, seconds
+from sceneslam.evaluation.report.summary import degrees, jump, number, percent, seconds
 from sceneslam.types.run import RunResult
 from sceneslam.types.trajectory import Trajectory
 from sceneslam.types.truth import GroundTruth
@@ -244,14 +244,24 @@ def _switches(metrics: Metrics) -> str:
             switch["to"],
             number(switch["confirm_delay_s"], 2, " s"),
             number(switch["gap_s"], 2, " s"),
-            number(switch["jump_m"], 4, " m"),
-            degrees(switch["jump_rad"]),
+            *_jump(switch),
             number(switch["cost_ms"], 1, " ms"),
         ]
         for switch in metrics["switches"]
     ]
-    note = "Delay: from the true change. Jump and turn: error of the motion across the hand-over."
+    note = (
+        "Delay: from the true change. Jump and turn: error of the motion across the hand-over; "
+        "without ground truth, how far it moved the current pose (“moved”)."
+    )
     return markup.table(heads, rows) + f'<p class="muted">{note}</p>'
+
+
+def _jump(switch: Mapping[str, Any]) -> list[str]:
+    """Return the cells of the columns jump and turn."""
+    if not jump(switch, 4):
+        return [number(None), number(None)]
+    moved = "" if switch["jump_is_error"] else "moved "
+    return [moved + number(switch["jump_m"], 4, " m"), moved + degrees(switch["jump_rad"])]
 
 
 def _modules(metrics: Metrics, slam: Mapping[str, Any]) -> str:

@@ -6,7 +6,7 @@ from typing import Any
 
 from sceneslam.evaluation.gaps import in_words
 from sceneslam.evaluation.metrics import Metrics
-from sceneslam.evaluation.report.summary import degrees, number, percent, seconds
+from sceneslam.evaluation.report.summary import jump, number, percent, seconds
 
 _TOLD_SWITCHES = 8
 _WHY = {
@@ -62,15 +62,14 @@ def _change(metrics: Metrics, switch: dict[str, Any]) -> str:
     text = f"At {seconds(metrics, switch['stamp_ns']):.1f} s “{switch['to']}” {what}, because {why}"
     if switch["confirm_delay_s"] is not None:
         text += f", {switch['confirm_delay_s']:.2f} s after it really changed"
-    if switch["jump_m"] is None:
+    if switch["gap_s"] is None:
         return text + "."
-    text += (
-        f"; the trajectory is off by {number(switch['jump_m'], 3, ' m')} and "
-        f"{degrees(switch['jump_rad'])} across the change"
-    )
-    if switch["gap_s"]:
-        return text + f" and has no pose for {switch['gap_s']:.2f} s."
-    return text + " and has no gap."
+    gap = f"no pose for {switch['gap_s']:.2f} s" if switch["gap_s"] else "no gap"
+    size = jump(switch, 3)
+    if switch["jump_is_error"]:
+        return text + f"; the trajectory is off by {size} across the change and has {gap}."
+    moved = f"the current pose was moved by {size}, and " if size else ""
+    return text + f"; {moved}the trajectory has {gap}."
 
 
 def _accuracy(metrics: Metrics) -> str:

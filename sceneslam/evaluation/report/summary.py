@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 from sceneslam.evaluation.gaps import in_words
@@ -45,6 +46,14 @@ def degrees(value_rad: float | None, digits: int = 2) -> str:
     return number(value_rad, digits, "°", math.degrees(1.0))
 
 
+def jump(switch: Mapping[str, Any], digits: int) -> str:
+    """Return the jump of a switch, empty if it is unknown or the pose did not move at all."""
+    jump_m, jump_rad = switch["jump_m"], switch["jump_rad"]
+    if jump_m is None or not (switch["jump_is_error"] or jump_m or jump_rad):
+        return ""
+    return f"{number(jump_m, digits, ' m')} and {degrees(jump_rad)}"
+
+
 def _what_was_seen(metrics: Metrics) -> str:
     dropped = f" ({metrics['dropped']} dropped)" if metrics["dropped"] else ""
     p50_ms, p99_ms = metrics["latency_ms"]["p50"], metrics["latency_ms"]["p99"]
@@ -80,10 +89,11 @@ def _switch_line(metrics: Metrics, switch: dict[str, Any]) -> str:
     what = f"{switch['from']} -> {switch['to']}"
     if switch["from"] == switch["to"]:
         what = f"{switch['to']} began anew"
+    name = "jump" if switch["jump_is_error"] else "moved by"
+    jumped = f"{name} {size}, " if (size := jump(switch, 3)) else ""
     return (
         f"{seconds(metrics, switch['stamp_ns']):.1f} s: {what} "
-        f"({switch['reason']}: {switch['scene']}){delay}, "
-        f"jump {number(switch['jump_m'], 3, ' m')} {degrees(switch['jump_rad'])}, "
+        f"({switch['reason']}: {switch['scene']}){delay}, {jumped}"
         f"gap {number(switch['gap_s'], 2, ' s')}"
     )
 
