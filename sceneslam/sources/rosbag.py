@@ -12,7 +12,7 @@ from sceneslam.ros.pixels import DepthUnits
 from sceneslam.sources.bag.frames import FrameTree
 from sceneslam.sources.bag.observation import PRIMARY, BundleDecoder, Decoded, measured
 from sceneslam.sources.bag.open_recording import open_recording
-from sceneslam.sources.bag.pace import Pace
+from sceneslam.sources.bag.pace import StreamPace
 from sceneslam.sources.bag.recording import Message
 from sceneslam.sources.bag.rig import (
     Given,
@@ -172,7 +172,7 @@ class RosBag:
         synchroniser = Synchroniser(primary, frozenset(self._by_sensor), self._sync_tolerance_s)
         begin_ns = min((one.log_ns for one in self._firsts.values()), default=0)
         paced = {one: self._by_sensor[one] for one in (self._primary, *self._firsts)}
-        pace = Pace(paced, self._silent_after_s, begin_ns)
+        pace = StreamPace(paced, self._silent_after_s, begin_ns)
         for message in self._recording.messages(topics):
             samples = list(self._samples(message))
             pace.look(message.log_ns)

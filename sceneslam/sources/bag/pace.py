@@ -8,7 +8,7 @@ from sceneslam.sources.bag.observation import PRIMARY
 from sceneslam.types.rig import Sensor
 
 
-class Pace:
+class StreamPace:
     """Detects topics without a message for longer than `silent_after_s`.
 
     Times are those of arrival: on this machine, or in the recording.

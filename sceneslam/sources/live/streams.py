@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
 from statistics import median
 
-from sceneslam.sources.bag.pace import Pace
+from sceneslam.sources.bag.pace import StreamPace
 from sceneslam.sources.live.clock import Lined, StampOrder
 from sceneslam.types.rig import Sensor
 from sceneslam.types.run import Event
@@ -27,7 +27,7 @@ class Streams:
     def __init__(self, topics: Mapping[Sensor, str], silent_after_s: float, now_ns: int) -> None:
         self._topics = topics
         self._silent_ns = round(silent_after_s * 1e9)
-        self._pace = Pace(topics, silent_after_s, now_ns)
+        self._pace = StreamPace(topics, silent_after_s, now_ns)
         self._first_ns: dict[str, int] = {}
         self._told_ns: dict[tuple[str, str], int] = {}
         self._followed: dict[str, int] = {}  # topic -> used publisher
