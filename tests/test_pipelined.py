@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import weakref
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,12 +11,13 @@ from fakes import PERIOD_NS, RIG, observation, true_pose
 
 from sceneslam.modules.slam.pipelined import Pipelined
 from sceneslam.motion.late import Pipeline
+from sceneslam.motion.model import MotionModel
 from sceneslam.testing import check_module
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import Tracking, TrackingStatus
-from sceneslam.types.rig import Sensor
+from sceneslam.types.rig import Sensor, Wheels
 from sceneslam.types.trajectory import Trajectory
 
 
@@ -188,15 +190,42 @@ def test_the_drift_of_a_systems_map_is_that_of_its_newest_answer():
     np.testing.assert_allclose(answers[3].map_covariance, se3.carried(2.0 * np.eye(6), T))
 
 
-def test_a_pose_that_is_carried_on_is_as_certain_as_the_newest_answer():
+def test_a_pose_that_is_carried_on_has_the_covariance_of_the_motion_too():
     given, lost = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]), {"status": TrackingStatus.LOST}
     answers = said({0: {"covariance": np.eye(6)}, 1: {"covariance": given}, 4: lost})
     assert answers[1].covariance is given
-    for answer in answers[2:4]:
-        T = se3.inverse(answer.T_local_base) @ answers[1].T_local_base
-        np.testing.assert_allclose(answer.covariance, se3.carried(given, T))
+    for index in (2, 3):
+        T = se3.inverse(answers[index].T_local_base) @ answers[1].T_local_base
+        model = MotionModel(RIG)
+        model.predict(observation(1))
+        moved = model.predict(observation(index)).covariance
+        grown = answers[index].covariance - se3.carried(given, T)
+        np.testing.assert_allclose(grown, moved, atol=1e-9)
     assert answers[4].covariance is None and answers[5].covariance is None
     assert all(answer.covariance is None for answer in said({0: {}})[1:])
+
+
+def test_a_pose_is_carried_on_by_the_wheels_of_the_rig():
+    class Certain(Exact):
+        def feed(self, observation):
+            covariance = np.eye(6) * 1e-6
+            return [replace(one, covariance=covariance) for one in super().feed(observation)]
+
+    found = []
+    for noise_ratio in (0.07, 0.7):
+        module = Pipelined(Certain(ready=lambda count: count == 1), 0.5)
+        module.activate(replace(RIG, wheels=Wheels(noise_ratio=noise_ratio)))
+        found.append([module.track(observation(index)) for index in range(3)][-1].covariance)
+    assert found[1][0, 0] > 50.0 * found[0][0, 0]
+
+
+def test_constant_velocity_is_less_certain_the_longer_it_lasts():
+    seen = {"covariance": np.eye(6) * 0.01**2}
+    answers = said({0: seen, 1: seen}, has_odometry=False)
+    deviations_m = [float(np.sqrt(answer.covariance[0, 0])) for answer in answers[1:]]
+    assert deviations_m[0] == pytest.approx(0.01)
+    assert np.all(np.diff(deviations_m) > 0.005)
+    assert 0.1 < deviations_m[-1] < 0.4  # 1.5 m/s^2 for 0.4 s are 0.12 m
 
 
 def test_a_system_may_begin_anew_only_where_it_says_that_it_is_lost():

@@ -40,7 +40,7 @@ class Pipelined(LocalModule):
 
     def activate(self, rig: Rig) -> None:
         """Start a session."""
-        self._pipeline = Pipeline(self._late_max_s)
+        self._pipeline = Pipeline(self._late_max_s, rig.wheels)
         self._system.activate(rig)
 
     def set_scene(self, scene: str) -> None:

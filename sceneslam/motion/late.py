@@ -8,8 +8,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.motion.model import MotionModel
+from sceneslam.motion.motion import still
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
+from sceneslam.types.rig import Rig, Sensor, Wheels
 from sceneslam.types.rows import Rows
 from sceneslam.types.trajectory import Trajectory
 
@@ -18,12 +21,14 @@ class Pipeline:
     """Matches answers with observations; odometry extends the newest pose until the next one.
 
     Without odometry the pose is extended at constant velocity. In both cases it is DEGRADED, or
-    LOST when the newest answer is older than `late_max_s`.
+    LOST when the newest answer is older than `late_max_s`. Its covariance grows by the motion's: by
+    the `wheels`, None: the usual ones, or by how fast a robot changes its velocity.
     """
 
-    def __init__(self, late_max_s: float) -> None:
+    def __init__(self, late_max_s: float, wheels: Wheels | None = None) -> None:
         self.revision = 0  # of the answers: it increases when a module corrects its past
         self._late_max_s = late_max_s
+        self._rig = Rig(sensors=frozenset({Sensor.ODOMETRY}), wheels=wheels or Wheels())
         self._waiting: dict[int, se3.Transform | None] = {}  # stamp -> T_odom_base
         self._is_late = False
         self._newest: Tracking | None = None
@@ -31,6 +36,7 @@ class Pipeline:
         self._first_ns: int | None = None
         self._T_local_base = se3.identity()  # the last reported pose
         self._twist_s, self._kept_revision = np.zeros(6), 0
+        self._step_s = 0.0  # over which the twist was measured; 0: it was not
         self._stamps_ns, self._poses = array("q"), Rows(4, 4)  # T_local_base, as it was answered
 
     def note(self, observation: Observation) -> None:
@@ -75,13 +81,30 @@ class Pipeline:
             stamp_ns=observation.stamp_ns,
             T_local_base=self._T_local_base.copy(),
             status=status,
-            covariance=reported if exact is not None else self._here(reported),
+            covariance=reported if exact is not None else self._grown(reported, observation),
             map_covariance=self._here(None if newest is None or is_lost else newest.map_covariance),
             quality_ratio=newest.quality_ratio if newest is not None else 0.0,
             inliers=newest.inliers if newest is not None else 0,
             revision=self.revision,
             can_begin=newest is not None and is_lost and newest.can_begin,
         )
+
+    def _grown(
+        self, covariance: NDArray[np.float64] | None, observation: Observation
+    ) -> NDArray[np.float64] | None:
+        """Return a covariance (6, 6) of the newest answer with that of the motion since then."""
+        here, newest = self._here(covariance), self._newest
+        if covariance is None or here is None or newest is None:
+            return None
+        model = MotionModel(self._rig)
+        has_odometry = self._T_odom_newest is not None and observation.T_odom_base is not None
+        if self._step_s > 0.0 and not has_odometry:
+            T_prev_curr = se3.exp(self._twist_s * self._step_s)
+            both = 2.0 * covariance  # of both poses that the velocity was measured by
+            model.inertia.learn(T_prev_curr, both, guess=still(), duration_s=self._step_s)
+        model.predict(Observation(stamp_ns=newest.stamp_ns, T_odom_base=self._T_odom_newest))
+        now = Observation(stamp_ns=observation.stamp_ns, T_odom_base=observation.T_odom_base)
+        return here + model.predict(now).covariance
 
     def _here(self, covariance: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
         """Return a covariance (6, 6) of the newest answer, in the axes of the pose now."""
@@ -119,8 +142,8 @@ class Pipeline:
     def _keep(self, answer: Tracking) -> None:
         if self._poses and answer.revision == self._kept_revision:
             T_prev_curr = se3.inverse(self._poses[-1]) @ answer.T_local_base
-            gap_s = (answer.stamp_ns - self._stamps_ns[-1]) * 1e-9
-            self._twist_s = se3.log(T_prev_curr) / gap_s
+            self._step_s = (answer.stamp_ns - self._stamps_ns[-1]) * 1e-9
+            self._twist_s = se3.log(T_prev_curr) / self._step_s
         self._stamps_ns.append(answer.stamp_ns)
         self._poses.append(answer.T_local_base)
         self._kept_revision = answer.revision
