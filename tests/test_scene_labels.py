@@ -19,7 +19,7 @@ from sceneslam.scenes.__main__ import main
 from sceneslam.scenes.examples import Example, MeasuredExample
 from sceneslam.scenes.label import Labels, cheapest
 from sceneslam.scenes.train import train
-from sceneslam.scenes.words import read_word
+from sceneslam.scenes.words import read_word, read_words
 from sceneslam.script import composed
 from sceneslam.types.trajectory import Trajectory
 
@@ -105,6 +105,17 @@ def test_every_instant_gets_the_module_whose_error_grew_least(runs, tmp_path, ca
     (first, second) = spans_of(tmp_path / "labels.yaml")
     assert first == ("eyes", 0.0) and second[0] == "laser" and second[1] == pytest.approx(5, abs=1)
     assert '"+scenes={eyes:[eyes,laser],laser:[laser,eyes]}"' in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("runs", [True], indirect=True)
+def test_labels_are_of_the_same_group_as_the_recording_by_another_path(runs, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for path in runs.rglob("config.yaml"):
+        path.write_text(path.read_text().replace(str(tmp_path / "film"), "./film"))
+    assert main(["label", "labels.yaml", "runs"]) == 0
+    first, *_ = read_words(["labels.yaml"])
+    assert first.config["source"]["path"] == "./film"
+    assert first.group == read_word(f"Any={tmp_path}/film").group
 
 
 @pytest.mark.parametrize("runs", [True], indirect=True)

@@ -112,7 +112,24 @@ def test_what_was_recorded_together_is_held_out_together(folders, tmp_path, caps
     assert main(["train", str(tmp_path / "model.yaml"), *words]) == 0
     assert "all 32 images" in capsys.readouterr().out
     assert main(["train", str(tmp_path / "one.yaml"), *words[:2]]) == 0
-    assert "not calibrated" in capsys.readouterr().out  # nothing would be left to train on
+    said = capsys.readouterr().out
+    assert "not calibrated" in said  # nothing would be left to train on
+    assert "never held out: Bright, Dark" in said
+    assert "divided" not in (tmp_path / "one.yaml").read_text()
+
+
+def test_a_scene_that_was_never_held_out_is_named_and_has_no_rate(folders, tmp_path, capsys):
+    words = [f"Bright={folders}/Bright_{k}" for k in (0, 1)] + [f"Dark={folders}/Dark_0"]
+    assert main(["train", str(tmp_path / "model.yaml"), *words]) == 0
+    assert "never held out: Dark\n" in capsys.readouterr().out
+    comment = (tmp_path / "model.yaml").read_text()
+    assert "not trained on: unknown." in comment and "# never held out: Dark\n" in comment
+
+
+def test_one_recording_is_one_group_by_whatever_path_it_is_named(folders, monkeypatch):
+    monkeypatch.chdir(folders)
+    paths = ("Bright_0", "./Bright_0", f"{folders}/Bright_0/", "Dark_0/../Bright_0@0:5")
+    assert len({read_word(f"Bright={path}").group for path in paths}) == 1
 
 
 def test_probabilities_are_no_more_certain_than_held_out_recordings_bear(folders, tmp_path):
@@ -301,7 +318,7 @@ def test_words_are_read_as_documented(folders):
     assert example.config["source"]["path"] == folder
     assert example.config["lights"] == "off" and example.config["effects"] is not None
     groups = {read_word(f"Dark={folder}{end}").group for end in ("/", "@0:5")}
-    assert groups == {folder}
+    assert groups == {str(Path(folder).resolve())}
 
 
 def test_model_that_ships_knows_rooms_and_streets(shared_data):

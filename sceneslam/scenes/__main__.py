@@ -23,7 +23,7 @@ from sceneslam.scenes.label import Table, label
 from sceneslam.scenes.model import Model
 from sceneslam.scenes.runs import read_runs
 from sceneslam.scenes.score import table, write_sheet
-from sceneslam.scenes.train import Judged, judge, train
+from sceneslam.scenes.train import Judged, Trained, judge, train
 from sceneslam.scenes.words import read_words
 from sceneslam.types.errors import InputError, SceneSlamError, text_of
 
@@ -61,15 +61,24 @@ def _train(options: argparse.Namespace, words: Sequence[str]) -> None:
     trained = train(seen, names)
     for line in _told(trained.held_out, "not calibrated: no recording could be held out"):
         print(line)
-    held_out = [one.is_right for one in trained.held_out]
-    share = f"{100 * np.concatenate(held_out).mean():.1f} %" if held_out else "unknown"
-    comment = [
-        f"Made by: {shlex.join([*_COMMAND, *words])}",
-        f"Right on recordings that it was not trained on: {share}. Its scores were divided by",
-        f"{trained.temperature:.3g}, so that its probabilities are right there.",
-    ]
-    trained.model.write(options.model, comment)
+    results = _results(trained)
+    if trained.never_held_out:
+        print(results[-1])
+    trained.model.write(options.model, [f"Made by: {shlex.join([*_COMMAND, *words])}", *results])
     print(f"model    {options.model} (detector=learned detector.path={options.model})")
+
+
+def _results(trained: Trained) -> list[str]:
+    """Return lines on the results on held-out recordings, the last one on the scenes without."""
+    held_out, never = [one.is_right for one in trained.held_out], trained.never_held_out
+    share = "unknown" if never else f"{100 * np.concatenate(held_out).mean():.1f} %"
+    lines = [f"Right on recordings that it was not trained on: {share}."]
+    if held_out:
+        divided = f"Its scores were divided by {trained.temperature:.3g}"
+        lines.append(f"{divided}, so that its probabilities are right there.")
+    if never:
+        lines.append(f"never held out: {', '.join(never)}")
+    return lines
 
 
 def _check_writable(path: Path) -> None:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from sceneslam.config.build import make_source
 from sceneslam.config.component import ComponentBuilder
 from sceneslam.types.errors import InputError
+from sceneslam.types.input_files import given_path
 from sceneslam.types.observation import Observation
 
 _THUMBNAIL_PX = 160  # wide
@@ -62,6 +63,11 @@ class MeasuredExample:
     features: NDArray[np.float64]  # (N, F)
     weights: NDArray[np.float64]  # (N,)
     thumbnails: Sequence[NDArray[np.uint8] | None]  # (N,), None for an observation without an image
+
+
+def group_of(path: str) -> str:
+    """Return the group of a recording, the same for all its paths."""
+    return str(given_path(path).resolve())
 
 
 def look(

@@ -12,6 +12,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from sceneslam.scenes.examples import group_of
 from sceneslam.scenes.runs import STEP_S, ModuleRun
 from sceneslam.types.errors import InputError
 
@@ -172,7 +173,8 @@ def _labelled(
     start_s: float,
 ) -> Labelled:
     source = run.config["source"]
-    group = str(source.get("path") or source.get("story") or source["_target_"])
+    path = source.get("path")
+    recorded = str(path or source.get("story") or source["_target_"])
     gains_m = _gains_mps(best, drift_mps) * STEP_S
     per_second = round(1.0 / STEP_S)
     known = np.flatnonzero(~np.isnan(drift_mps).any(axis=1))
@@ -191,8 +193,8 @@ def _labelled(
             )
         )
     return Labelled(
-        name=f"{group}, {run.folder.parent.name}/{run.folder.name}",
-        group=group,
+        name=f"{recorded}, {run.folder.parent.name}/{run.folder.name}",
+        group=group_of(recorded) if path else recorded,
         config={key: run.config.get(key) for key in ("source", "effects")},
         spans=spans,
     )

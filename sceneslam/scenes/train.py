@@ -48,6 +48,12 @@ class Trained:
     held_out: Sequence[Judged]  # empty if no recording could be held out
     temperature: float
 
+    @property
+    def never_held_out(self) -> tuple[str, ...]:
+        """Return the scenes for which there is no result on a held-out recording."""
+        held_out = _scenes([one.seen for one in self.held_out])
+        return tuple(scene for scene in self.model.scenes if scene not in held_out)
+
 
 def train(all_seen: Sequence[MeasuredExample], names: Sequence[str]) -> Trained:
     """Return the model of examples whose features have these names.

@@ -15,7 +15,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from sceneslam.config.check import check_keys
 from sceneslam.config.resolve import resolved
-from sceneslam.scenes.examples import Example, Stretch
+from sceneslam.scenes.examples import Example, Stretch, group_of
 from sceneslam.scenes.label import BestModuleSpan, Labels
 from sceneslam.types.errors import InputError
 from sceneslam.types.observation import UNSURE
@@ -74,7 +74,7 @@ def read_word(word: str) -> Example:
     name = " ".join([given, *overrides])
     return Example(
         scene=found["scene"],
-        group=found["group"] or path.rstrip("/"),
+        group=found["group"] or group_of(path),
         name=name,
         parts=[Stretch(start_s=start_s, end_s=end_s)],
         config=_config(path, overrides, name),
