@@ -15,7 +15,7 @@ from sceneslam.scans.occupancy_grid import drawn, walls
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import Observation, TrackingStatus
-from sceneslam.types.rig import Camera, Laser, Rig, Sensor
+from sceneslam.types.rig import Camera, Laser, Lidar, Rig, Sensor
 
 SETTINGS = yaml.safe_load(
     (Path(__file__).resolve().parent.parent / "conf/slam/laser.yaml").read_text()
@@ -148,6 +148,31 @@ def test_sweep_that_comes_after_newer_observations_is_matched_where_it_was_made(
     module = active()
     off_m = errors(fine, [module.track(observation) for observation in given])[:, 0]
     assert off_m.max() < 0.012
+
+
+@pytest.mark.parametrize("late_s", [0.0, -0.08])
+def test_the_motion_within_a_lidars_sweep_is_undone(late_s):
+    """It turns at 1 rad/s, and a sweep takes 0.1 s; or the clouds are older than the images."""
+    lidar = Lidar(range_m=(0.1, 30.0), T_base_lidar=se3.from_xy_yaw(0.2, 0.0, 0.5))
+    module = active(Rig(sensors=frozenset({Sensor.POINTS}), lidar=lidar))
+    beams = np.arange(720) * 2 * np.pi / 720
+    times_s = np.linspace(0.0, 0.1, 720, endpoint=False) + late_s
+    off_rad = []
+    for index in range(40):
+        begun_s = 0.1 * index
+        yaws = np.maximum(begun_s + times_s - 1.0, 0.0)  # it stands for a second
+        points = np.zeros((720, 3), np.float32)
+        for row, (beam, yaw) in enumerate(zip(beams, yaws, strict=True)):
+            at = se3.from_xy_yaw(0.0, 0.0, yaw) @ lidar.T_base_lidar
+            ahead = at[:2, :2] @ [np.cos(beam), np.sin(beam)]
+            walls = (np.sign(ahead) * [4.0, 3.0] - at[:2, 3]) / ahead  # of a room
+            points[row, :2] = walls.min() * np.array([np.cos(beam), np.sin(beam)])
+        found = module.track(
+            Observation(stamp_ns=index * 10**8, points_lidar=points, point_times_s=times_s)
+        )
+        off_rad.append(se3.yaw_rad(found.T_local_base) - max(begun_s - 1.0, 0.0))
+    off_rad = np.abs((np.array(off_rad) + np.pi) % (2 * np.pi) - np.pi)
+    assert off_rad[14:].max() < 0.01
 
 
 def test_observations_between_scans_are_predicted():

@@ -49,9 +49,8 @@ class CloudReader:
         times_s = observation.point_times_s
         if self.is_depth or times_s is None:
             return points
-        if len(times_s) != len(found):
-            raise InputError(f"point_times_s: expected {len(found)} values, got {len(times_s)}")
-        return points if twist_s is None else _moved(points, valid_times_s(times_s[valid]), twist_s)
+        check_times(times_s, found)
+        return points if twist_s is None else moved(points, valid_times_s(times_s[valid]), twist_s)
 
     def _sensed(self, observation: Observation) -> Cloud | None:
         if not self.is_depth:
@@ -81,7 +80,13 @@ def valid_times_s(times_s: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.nan_to_num(times_s, nan=0.0, posinf=0.0, neginf=0.0)
 
 
-def _moved(points: Cloud, times_s: NDArray[np.float64], twist_s: NDArray[np.float64]) -> Cloud:
+def check_times(times_s: NDArray[np.float64], points: NDArray[np.floating]) -> None:
+    """Raise InputError unless every point (N, 3) has a time (N,)."""
+    if len(times_s) != len(points):
+        raise InputError(f"point_times_s: expected {len(points)} values, got {len(times_s)}")
+
+
+def moved(points: Cloud, times_s: NDArray[np.float64], twist_s: NDArray[np.float64]) -> Cloud:
     """Return the points (N, 3) [m] moved by the twist times each point's time."""
     rate = twist_s[3:]
     speed = float(np.linalg.norm(rate))

@@ -43,7 +43,7 @@ class LidarScanner:
         self._T_laser_lidar = se3.inverse(self.T_base_laser) @ T_base_lidar
         self._range_m, self._beams = lidar.range_m, beams
 
-    def scan(self, points_lidar: NDArray[np.float32], *, stamp_ns: int) -> LaserScan:
+    def scan(self, points_lidar: NDArray[np.floating], *, stamp_ns: int) -> LaserScan:
         """Return the scan of a cloud (N, 3) [m], lidar, in `laser`.
 
         A beam without a return in the band is NaN: most of a lidar's beams have other directions.

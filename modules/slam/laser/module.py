@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sceneslam.motion.model import MotionModel
 from sceneslam.scans.depth_scan import DepthScanner
@@ -17,6 +18,7 @@ from sceneslam.types.observation import LaserScan, Observation, Tracking
 from sceneslam.types.planar import to_transform
 from sceneslam.types.rig import Rig, Sensor
 
+from ..clouds import check_times, moved, valid_times_s
 from ..local import LocalModule
 from .frontend import FrontEnd
 from .keyframes import ScanKeyframes
@@ -60,9 +62,12 @@ class LaserSlam(LocalModule):
     depth_beams: int
     depth_stride_px: int
     lidar_beams: int
+    deskew: bool
     _scanner: DepthScanner | LidarScanner | None = field(default=None, init=False)
     _front_end: FrontEnd | None = field(default=None, init=False)
     _T_base_laser: se3.Transform = field(default_factory=se3.identity, init=False)
+    _lidar_base: NDArray[np.float64] = field(default_factory=lambda: np.eye(6), init=False)
+    _velocity: NDArray[np.float64] = field(default_factory=lambda: np.zeros(6), init=False)
 
     def __post_init__(self) -> None:
         """Check the settings."""
@@ -95,7 +100,7 @@ class LaserSlam(LocalModule):
             self._T_base_laser = self._scanner.T_base_laser
         else:
             self._T_base_laser = se3.identity() if rig.laser is None else rig.laser.T_base_laser
-        self._front_end = self._make_front_end(rig)
+        self._front_end, self._velocity = self._make_front_end(rig), np.zeros(6)
 
     def track(self, observation: Observation) -> Tracking:
         """Return T_local_base at the observation."""
@@ -123,15 +128,28 @@ class LaserSlam(LocalModule):
     def _scan(self, observation: Observation) -> LaserScan | None:
         stamp_ns = observation.stamp_ns
         if isinstance(self._scanner, LidarScanner) and observation.points_lidar is not None:
-            return self._scanner.scan(observation.points_lidar, stamp_ns=stamp_ns)
+            return self._scanner.scan(self._points_lidar(observation), stamp_ns=stamp_ns)
         if isinstance(self._scanner, DepthScanner) and observation.depth_m is not None:
             return self._scanner.scan(observation.depth_m, stamp_ns=stamp_ns)
         return observation.scan
+
+    def _points_lidar(self, observation: Observation) -> NDArray[np.floating]:
+        """Return the cloud (N, 3) [m], lidar, as from the observation's instant."""
+        points, times_s = observation.points_lidar, observation.point_times_s
+        assert points is not None and self._front_end is not None
+        if times_s is None or not self.deskew:
+            return points
+        check_times(times_s, points)
+        # Poses say what the velocity is, and depend on it here: of one step alone, it would swing.
+        before, self._velocity = self._velocity, self._front_end.motion.inertia.velocity
+        twist_s = self._lidar_base @ (0.5 * (before + self._velocity))
+        return moved(points.astype(np.float64), valid_times_s(times_s), twist_s)
 
     def _make_scanner(self, rig: Rig) -> DepthScanner | LidarScanner | None:
         if Sensor.SCAN in rig.sensors:
             return None
         if rig.lidar is not None and Sensor.POINTS in rig.sensors:
+            self._lidar_base = se3.adjoint(se3.inverse(rig.lidar.T_base_lidar))
             return LidarScanner(
                 rig.lidar,
                 height_min_m=self.height_min_m,
