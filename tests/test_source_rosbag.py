@@ -717,7 +717,20 @@ def test_times_of_points_count_from_the_observation(tmp_path: Path, is_absolute:
     np.testing.assert_allclose(one.point_times_s, [-0.04, 0.01], atol=1e-6)
 
 
-def cloud_message(stamp_ns: int, times_s: np.ndarray) -> Any:
-    points = np.ones((len(times_s), 3), np.float32)
+@pytest.mark.parametrize("late_s", [0.04, 0.0])
+def test_points_without_times_are_as_old_as_their_cloud(tmp_path: Path, late_s: float) -> None:
+    stamp_ns = STAMP_NS - round(late_s * 1e9)
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        recorder.image("/rgb", STAMP_NS, COLOR)
+        recorder.add("/points", stamp_ns, cloud_message(stamp_ns, None))
+    (one,) = make_source("rosbag", tmp_path / "a.mcap")
+    if late_s == 0.0:
+        assert one.point_times_s is None
+    else:
+        np.testing.assert_allclose(one.point_times_s, [-late_s] * 2)
+
+
+def cloud_message(stamp_ns: int, times_s: np.ndarray | None) -> Any:
+    points = np.ones((2, 3), np.float32)
     data = Encoder().points(stamp_ns, points, times_s)
     return get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr(data, "sensor_msgs/msg/PointCloud2")

@@ -148,9 +148,11 @@ class BundleDecoder:
         if found is None:
             problems.append("a point cloud is shorter than it says")
             return None
-        times_s = found.point_times_s
+        times_s, late_s = found.point_times_s, (sample.stamp_ns - bundle.primary.stamp_ns) * 1e-9
+        if times_s is None and late_s != 0.0:
+            times_s = np.zeros(len(found.points_lidar))
         if times_s is not None:
-            times_s = locked(times_s + (sample.stamp_ns - bundle.primary.stamp_ns) * 1e-9)
+            times_s = locked(times_s + late_s)
         return Cloud(points_lidar=locked(found.points_lidar), point_times_s=times_s)
 
     def _odometry(self, bundle: SynchronisedSamples) -> NDArray[np.float64] | None:
