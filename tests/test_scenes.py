@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from sceneslam.config.resolve import resolved
 from sceneslam.detection.run import detect
 from sceneslam.interfaces import FeatureDetector
 from sceneslam.scenes.__main__ import main
-from sceneslam.scenes.examples import Example, MeasuredExample, _Collected
+from sceneslam.scenes.examples import Example, MeasuredExample, Stretch, _Collected, look
 from sceneslam.scenes.model import Model, fit
 from sceneslam.scenes.score import table, write_sheet
 from sceneslam.scenes.train import Judged
@@ -293,11 +294,34 @@ def test_calibration_counts_all_images_of_three_scenes():
     assert sum(counts) == 3, lines
 
 
-def test_sheet_shows_the_image_of_each_wrong_vote(tmp_path):
-    class Mean:
-        def get_features(self, observation):
-            return np.array([0.0])
+class Mean:
+    """A feature that every observation has."""
 
+    def get_features(self, observation):
+        return np.array([0.0])
+
+
+def test_the_number_of_images_is_that_of_each_example(tmp_path):
+    folder = write_images(tmp_path / "film", "Dark", range(100))  # 10 Hz
+    rate = "source.rate_hz=10"
+    for word, expected in (("@8:10", 10), ("@1:9", 10), ("", 10)):
+        (seen,) = look([read_word(f"Dark='{folder}{word}' {rate}")], Mean(), 10)
+        assert expected <= len(seen.features) < 2 * expected, word
+
+
+def test_weights_of_a_weighted_example_add_up_to_the_gain_of_its_parts(tmp_path):
+    folder = write_images(tmp_path / "film", "Dark", range(100))
+    one = read_word(f"Dark={folder} source.rate_hz=10")
+    parts = [Stretch(start_s=0, end_s=4, weight_per_s=0.5)]
+    parts.append(Stretch(start_s=6, end_s=7, weight_per_s=3.0))
+    example = replace(one, parts=parts, is_weighted=True)
+    for images in (5, 40):
+        (seen,) = look([example], Mean(), images)
+        assert seen.weights.sum() == pytest.approx(5.0)
+        assert seen.weights[-1] == pytest.approx(6.0 * seen.weights[0])
+
+
+def test_sheet_shows_the_image_of_each_wrong_vote(tmp_path):
     collected = _Collected(Example(scene="Bright", group="a", name="a", parts=[], config={}))
     for grey in (None, 50, 200):
         image = None if grey is None else np.full((10, 16, 3), grey, np.uint8)

@@ -153,7 +153,9 @@ def _parser() -> argparse.ArgumentParser:
             "was recorded together; 'SCENE=PATH@FROM:TO effects=lights_out' takes seconds and "
             "keys; or a file that `label` wrote",
         )
-        command.add_argument("--images", type=int, default=200, help="of each example (200)")
+        command.add_argument(
+            "--images", type=int, default=200, help="of each example, or up to twice as many (200)"
+        )
     commands.choices["train"].add_argument(
         "--features", default=_FEATURES, help=f"by commas ({_FEATURES})"
     )

@@ -37,6 +37,9 @@ class Stretch:
     weight_per_s: float = 1.0
 
 
+_WHOLE = Stretch(start_s=0.0, end_s=np.inf)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Example:
     """The parts of a recording that show one scene."""
@@ -75,9 +78,9 @@ def look(
 ) -> list[MeasuredExample]:
     """Return the features of every n-th observation of each example.
 
-    n is the recording's length over `images`, rounded down; 1 if the length is unknown.
-    Consecutive examples of one recording are read together. Raises ConfigError or InputError if a
-    recording cannot be read, or an example has no observation.
+    n is such that an example has at least `images`, if its parts are long enough, and less than
+    twice as many. Consecutive examples of one recording are read together. Raises ConfigError or
+    InputError if a recording cannot be read, or an example has no observation.
     """
     seen: list[MeasuredExample] = []
     for _, found in groupby(examples, key=lambda example: id(example.config)):
@@ -90,6 +93,7 @@ class _Collected:
     """The data of an example while its recording is read."""
 
     example: Example
+    step: int = 1
     count: int = 0
     rows: list[NDArray[np.float64]] = field(default_factory=list)
     weights: list[float] = field(default_factory=list)
@@ -104,6 +108,12 @@ class _Collected:
         image_bgr = observation.image_bgr
         self.thumbnails.append(None if image_bgr is None else _thumbnail(image_bgr))
 
+    def thin_out(self) -> None:
+        """Keep every second observation, of later ones, too."""
+        self.step *= 2
+        for kept in (self.rows, self.weights, self.thumbnails):
+            del kept[1::2]
+
     def seen(self) -> MeasuredExample:
         if not self.rows:
             scene, name = self.example.scene, self.example.name
@@ -111,9 +121,17 @@ class _Collected:
         return MeasuredExample(
             example=self.example,
             features=np.array(self.rows),
-            weights=np.array(self.weights),
+            weights=self._scaled(),
             thumbnails=self.thumbnails,
         )
+
+    def _scaled(self) -> NDArray[np.float64]:
+        """Return the weights (N,); those of a weighted example add up to that of its parts."""
+        weights, parts = np.array(self.weights), self.example.parts
+        if not self.example.is_weighted or not weights.any():
+            return weights
+        total = sum(part.weight_per_s * (part.end_s - part.start_s) for part in parts)
+        return np.asarray(weights * (total / weights.sum()))
 
 
 def _look(
@@ -121,9 +139,12 @@ def _look(
 ) -> list[MeasuredExample]:
     """Return the features of examples of one recording."""
     source = make_source(examples[0].config, ComponentBuilder(examples[0].config))
-    step = max(1, (source.length or images) // images)
     end_s = max(part.end_s for example in examples for part in example.parts)
-    collected = [_Collected(example) for example in examples]
+    whole_step = max(1, (source.length or images) // images)
+    collected = [
+        _Collected(example, step=whole_step if _WHOLE in example.parts else 1)
+        for example in examples
+    ]
     first_ns: int | None = None
     for observation in source:
         first_ns = observation.stamp_ns if first_ns is None else first_ns
@@ -133,8 +154,10 @@ def _look(
         for one in collected:
             weight = one.example.weight(time_s)
             if weight is not None:
-                if one.count % step == 0:
+                if one.count % one.step == 0:
                     one.take(observation, weight, features)
+                    if len(one.rows) == 2 * images:
+                        one.thin_out()
                 one.count += 1
     return [one.seen() for one in collected]
 
