@@ -54,6 +54,15 @@ def test_lenses_bend_no_rays():
     assert (np.hypot(*found.rays[outer].T) > 1.03 * np.hypot(*straight.rays[outer].T)).all()
 
 
+def test_corners_where_a_lens_model_folds_are_left_out():
+    """It folds 330 px from the centre: beyond, rays came out a thousand times too long."""
+    folded = replace(
+        CAMERA, fx=340.0, fy=340.0, cx=320.0, cy=240.0, distortion=(-0.33, 0.12, 0.0, 0.0, -0.02)
+    )
+    view = LandmarkViewer(folded).look(seen())
+    assert len(view.rays) > 50 and np.abs(view.rays).max() < 3.0
+
+
 def test_what_shows_too_little_is_no_view():
     viewer = LandmarkViewer(CAMERA)
     assert viewer.look(seen(np.zeros((480, 640, 3), np.uint8))) is None  # dark

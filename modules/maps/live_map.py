@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.scans.depth_scan import DepthScanner, scan_frame
 from sceneslam.scans.occupancy_grid import OccupancyGrid
 from sceneslam.types.errors import ConfigError
+from sceneslam.types.lens import undistorted_rays
 from sceneslam.types.maps import HybridMap, PointLayer
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig, Sensor
@@ -71,8 +71,9 @@ class GridAndPoints:
         rows, columns, depths = rows[is_measured], columns[is_measured], depths[is_measured]
         if not len(depths):
             return
-        pixels = np.column_stack([columns, rows]).astype(np.float64)[:, None]
-        rays = cv2.undistortPoints(pixels, camera.K, np.array(camera.distortion))[:, 0]
+        rays = undistorted_rays(camera, np.column_stack([columns, rows]).astype(np.float64))
+        known = np.isfinite(rays[:, 0])
+        rays, rows, columns, depths = rays[known], rows[known], columns[known], depths[known]
         points_cam = np.column_stack([rays * depths[:, None], depths])
         points = apply(T_map_base @ camera.T_base_cam, points_cam).astype(np.float32)
         colors = np.full((len(points), 3), _UNSEEN_BGR, np.uint8)

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.types.lens import undistorted_rays
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Camera, Rig, Sensor
 from sceneslam.types.se3 import Transform
@@ -84,18 +85,22 @@ class LandmarkViewer:
         grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
         grey = brightened(grey, noise_max=_NOISE_MAX)
         corners, found = self._orb.detectAndCompute(grey, None)
-        if len(corners) < _FEWEST:
+        if found is None:
             return None
         uv_px = np.array([corner.pt for corner in corners])
+        rays = undistorted_rays(camera, uv_px)
+        known = np.isfinite(rays[:, 0])
+        uv_px, rays, found = uv_px[known], rays[known], np.asarray(found, np.uint8)[known]
+        if len(rays) < _FEWEST:
+            return None
         z = np.zeros(len(uv_px), np.float32)
         if depth_m is not None:
             column, row = np.rint(uv_px).astype(np.int64).T
             z = depth_m[row, column]
             z = np.where(camera.measures(z), z, np.float32(0.0))
-        rays = cv2.undistortPoints(uv_px[:, None], camera.K, np.array(camera.distortion))[:, 0]
         return LandmarkView(
             rays=rays.astype(np.float32),
-            descriptors=np.asarray(found, np.uint8),
+            descriptors=found,
             depth_m=z,
             shear_rad=shear_rad,
         )
