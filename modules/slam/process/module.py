@@ -100,7 +100,7 @@ class ProcessSlam(LocalModule, Restarted[Program]):
         if self._running is None:
             self._start()
         self._greet()
-        self._pipeline = Pipeline(self._late_max_s)
+        self._pipeline = Pipeline(self._late_max_s, rig.wheels)
         self._layers = None
         self._is_active = True
         self._ask("activate", rig_fields(rig), self._limits.start_deadline_s, lambda _: None)
