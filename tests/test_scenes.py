@@ -94,6 +94,26 @@ def test_a_sheet_that_is_no_image_is_named_before_a_recording_is_read(
     assert f"error: --sheet: got {tmp_path / name}, allowed: an image" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("name", ["folder.png", "file/wrong.png"])
+def test_a_sheet_that_cannot_be_written_is_named_before_a_recording_is_read(
+    model, capsys, tmp_path, monkeypatch, name
+):
+    (tmp_path / "folder.png").mkdir()
+    (tmp_path / "file").write_text("")
+    monkeypatch.setattr("sceneslam.scenes.__main__.look", None)  # reading fails
+    words = [f"Dark={tmp_path}", "--sheet", str(tmp_path / name)]
+    assert main(["test", str(model), *words]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("error: ") and str(tmp_path) in said and said.count("\n") == 1
+
+
+def test_a_sheet_that_could_not_be_written_is_an_error(tmp_path, monkeypatch):
+    monkeypatch.setattr(cv2, "imwrite", lambda *_: False)  # such as a full disk
+    image = np.zeros((10, 16, 3), np.uint8)
+    with pytest.raises(InputError, match=r"--sheet: got .*wrong\.png, which could not be written"):
+        write_sheet([judged([[0.1, 0.8, 0.1]], [image])], tmp_path / "wrong.png")
+
+
 def test_detector_votes_as_the_model_does_with_probabilities_that_sum_to_one(folders, model):
     detector, read = learned(model), Model.read(model)
     for folder in ("Bright_2", "Dark_2"):

@@ -55,7 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _train(options: argparse.Namespace, words: Sequence[str]) -> None:
-    _check_writable(options.model)
+    _check_writable(options.model, "model", "a YAML file")
     names = options.features.split(",")
     seen = _look(options, names)
     trained = train(seen, names)
@@ -81,21 +81,22 @@ def _results(trained: Trained) -> list[str]:
     return lines
 
 
-def _check_writable(path: Path) -> None:
+def _check_writable(path: Path, name: str, kind: str) -> None:
     """Raise InputError or OSError for a file that cannot be written, before hours are spent on it.
 
     What is missing of its folder is made.
     """
     if path.is_dir():
-        raise InputError(f"model: got {path}, a folder, allowed: a YAML file")
+        raise InputError(f"{name}: got {path}, a folder, allowed: {kind}")
     path.parent.mkdir(parents=True, exist_ok=True)
     if not os.access(path if path.exists() else path.parent, os.W_OK):
-        raise InputError(f"model: got {path}, allowed: a file that can be written")
+        raise InputError(f"{name}: got {path}, allowed: a file that can be written")
 
 
 def _test(options: argparse.Namespace) -> None:
     if not cv2.haveImageWriter(str(options.sheet)):
         raise InputError(f"--sheet: got {options.sheet}, allowed: an image, such as wrong.png")
+    _check_writable(options.sheet, "--sheet", "an image")
     model = Model.read(options.model)
     seen = _look(options, model.features)
     for one in seen:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.scenes.train import Judged
+from sceneslam.types.errors import InputError
 
 _BINS = (0.0, 0.5, 0.7, 0.9, 0.99)  # lower limits of the probability bins
 _SHOWN = 48  # images on a sheet, by decreasing probability
@@ -33,7 +34,10 @@ def table(judged: Sequence[Judged]) -> Iterator[str]:
 
 
 def write_sheet(judged: Sequence[Judged], path: Path) -> int:
-    """Write one sheet of wrongly classified images; return their number."""
+    """Write one sheet of wrongly classified images; return their number.
+
+    Raises InputError if it cannot be written.
+    """
     wrong = [
         (float(probability), one, place, image)
         for one in judged
@@ -50,7 +54,8 @@ def write_sheet(judged: Sequence[Judged], path: Path) -> int:
     cells += [np.full_like(cells[0], 255)] * (-len(cells) % _COLUMNS)
     rows = [np.hstack(cells[at : at + _COLUMNS]) for at in range(0, len(cells), _COLUMNS)]
     path.parent.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(path), np.vstack(rows))
+    if not cv2.imwrite(str(path), np.vstack(rows)):
+        raise InputError(f"--sheet: got {path}, which could not be written")
     return len(wrong)
 
 
