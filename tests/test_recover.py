@@ -65,6 +65,16 @@ def test_a_killed_run_is_recovered_as_it_would_have_been_written(tmp_path, hando
     assert "recovered from its journal" in page and "what detector, bus and modules cost" in page
 
 
+def test_reasons_and_counts_that_were_not_kept_are_named(tmp_path, capsys):
+    folder = killed(tmp_path, 20)
+    assert main([str(folder)]) == 0
+    said = capsys.readouterr().err
+    assert "missing: the sensor data that modules lacked: poses that are bridged" in said
+    assert "missing: the number of dropped observations" in said
+    errors = " ".join(json.loads((folder / "metrics.json").read_text())["errors"])
+    assert "recovered without the sensor data that modules lacked" in errors
+
+
 def test_events_that_cannot_be_written_again_cost_no_pose(tmp_path, monkeypatch, capsys):
     def fail(path):
         raise OSError("no space left on device")

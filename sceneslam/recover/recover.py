@@ -37,6 +37,9 @@ from sceneslam.types.truth import GroundTruth
 _NEVER_KEPT = (
     "the map that the active module had when the run was cut off, and what it would have revised",
     "what detector, bus and modules cost",
+    "the sensor data that modules lacked: poses that are bridged or missing for that have another "
+    "reason here, such as “during a change of module”",
+    "the number of dropped observations",
 )
 
 
