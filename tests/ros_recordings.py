@@ -145,3 +145,16 @@ class Recorder:
             **fields,
         )
         self.add(topic, stamp_ns, message)
+
+    def transform(self, parent: str, child: str, x_m: float) -> Any:
+        """Return a TransformStamped: `child` is so far ahead of `parent`."""
+        return self.new(
+            "geometry_msgs/msg/TransformStamped",
+            header=self.header(STAMP_NS, parent),
+            child_frame_id=child,
+            transform=self.new(
+                "geometry_msgs/msg/Transform",
+                translation=self.new("geometry_msgs/msg/Vector3", x=x_m, y=0.0, z=0.0),
+                rotation=self.new("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
+            ),
+        )

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from fakes import ExactModule, observation
 
+from sceneslam.answers import checked_layers, checked_tracking, checked_trajectory
 from sceneslam.atlas.fusion import Placed, fuse
 from sceneslam.atlas.save import save_points
-from sceneslam.answers import checked_layers, checked_tracking, checked_trajectory
 from sceneslam.storage.journal import Journal, JournalHeader, read_journal
 from sceneslam.types import se3
 from sceneslam.types.maps import (
