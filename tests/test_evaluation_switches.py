@@ -232,3 +232,13 @@ def test_seam_of_a_module_that_begins_anew_lies_where_its_new_poses_begin():
     assert any("rgbd began anew (lost: " in line for line in summary_lines(metrics))
     entries = chronicle(began_anew(), metrics["switches"], value_label="mean of grey")
     assert entries[-1].what == "“rgbd” begins anew"
+
+
+def test_what_a_module_lacked_is_not_said_where_it_was_not_kept():
+    run = relabel(switched_run(), slice(90, 100), "")
+    lacked = {int(stamp_ns): "a depth image" for stamp_ns in stamps(200)[90:100]}
+    told = [
+        evaluate(replace(run, missing=missing), None, settings=SETTINGS)["bridged_why"]
+        for missing in (lacked, None)
+    ]
+    assert told == [{"without a depth image": 10}, {"for a reason that was not kept": 10}]

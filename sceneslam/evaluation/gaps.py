@@ -38,11 +38,14 @@ def _reasons(stamps_ns: NDArray[np.int64], result: RunResult) -> dict[str, int]:
         while place < len(events) and events[place]["stamp_ns"] <= stamp_ns:
             state = _state(events[place], state)
             place += 1
-        lacking = result.missing.get(stamp_ns)
+        lacking = "" if result.missing is None else result.missing.get(stamp_ns)
         counts[f"without {lacking}" if lacking else state] += 1
+    if result.missing is None and _CHANGING in counts:
+        counts["for a reason that was not kept"] = counts.pop(_CHANGING)
     return dict(counts.most_common())
 
 
+_CHANGING = "during a change of module"
 _STATES: Sequence[str] = ("tracking", "suspect", "fault")
 
 
@@ -54,4 +57,4 @@ def _state(event: Event, state: str) -> str:
         return f"while {event['module']} was rejected"
     if event["status"] == "lost":
         return f"while {event['module']} was lost"
-    return "during a change of module"
+    return _CHANGING

@@ -37,8 +37,7 @@ from sceneslam.types.truth import GroundTruth
 _NEVER_KEPT = (
     "the map that the active module had when the run was cut off, and what it would have revised",
     "what detector, bus and modules cost",
-    "the sensor data that modules lacked: poses that are bridged or missing for that have another "
-    "reason here, such as “during a change of module”",
+    "the sensor data that modules lacked",
     "the number of dropped observations",
 )
 
@@ -197,6 +196,7 @@ def _result(
         map=fused_map_of(atlas, fault),
         events=events,
         timings=Timings(detector_us=nothing, bus_us=nothing, module_ms={}, wall_s=0.0),
+        missing=None,
     )
 
 

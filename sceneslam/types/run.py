@@ -90,7 +90,8 @@ class RunResult:
     map: HybridMap
     events: Sequence[Event]
     timings: Timings
-    missing: Mapping[int, str] = field(default_factory=dict)  # stamp -> what the module lacked
+    # Stamp -> what the module lacked; None: not kept.
+    missing: Mapping[int, str] | None = field(default_factory=dict)
     dropped: int = 0  # observations that live mode skipped
     dropped_images: int = 0  # those of them with an image
     moments: Sequence[KeyMoment] = ()  # ordered by stamp
