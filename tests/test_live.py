@@ -156,6 +156,15 @@ def interrupt():
     signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
 
 
+@pytest.fixture
+def heeds_ctrl_c():
+    """A shell's background process ignores it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("heeds_ctrl_c")
 def test_ctrl_c_is_raised_after_the_step_that_runs():
     ended = threading.Event()
 
@@ -170,6 +179,7 @@ def test_ctrl_c_is_raised_after_the_step_that_runs():
     assert ended.is_set() and raised.type is KeyboardInterrupt
 
 
+@pytest.mark.usefixtures("heeds_ctrl_c")
 def test_ctrl_c_while_the_last_step_is_waited_for_is_told_apart():
     is_raised = threading.Event()
 
