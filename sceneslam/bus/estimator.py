@@ -156,14 +156,11 @@ class Estimator:
             is_jump = last.tracking is not None and last.tracking.revision != answer.revision
             bridge.update(each.observation, T_map_base, is_jump=is_jump)
             last = replace(each, T_map_base=T_map_base, module=runner.key, bridge=bridge.copy())
-            if (
-                suspicion.noticed_ns <= each.stamp_ns < moment.stamp_ns
-            ):  # else it is doubted already
+            if suspicion.noticed_ns <= each.stamp_ns < moment.stamp_ns:  # its answer was kept back
                 last = replace(last, tracking=self.session.doubted(answer))
+                self._back_end.add_local(each.stamp_ns, answer.T_local_base)
             told.append(last)
             missed = []
-            if suspicion.noticed_ns <= each.stamp_ns < moment.stamp_ns:
-                self._back_end.add_local(each.stamp_ns, answer.T_local_base)
         return self._retell(told)
 
     def _retell(self, moments: list[BufferedObservation]) -> BufferedObservation:
