@@ -100,6 +100,14 @@ def test_gap_that_is_no_time_is_refused(tmp_path, capsys, gap_s):
     assert capsys.readouterr().err.startswith("error: --max-gap-s: got ")
 
 
+@pytest.mark.parametrize("order", [("poses.tum", "kitti.txt"), ("kitti.txt", "poses.tum")])
+def test_file_with_stamps_is_not_compared_with_one_without(tmp_path, capsys, order):
+    four_poses().write_tum(tmp_path / "poses.tum")
+    (tmp_path / "kitti.txt").write_text("1 0 0 1 0 1 0 2 0 0 1 3\n" * 4)
+    assert main(["ate", *(f"{tmp_path / name}" for name in order)]) == 2
+    assert "score against the groundtruth.tum of the run" in capsys.readouterr().err
+
+
 def test_command_line_prints_relation_errors(tmp_path, capsys):
     four_poses().write_tum(tmp_path / "poses.tum")
     (tmp_path / "x.relations").write_text(" # t1 t2 x y z r p y\n0 1 0.1 0 0 0 0 0.2\n")

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sceneslam.evaluation.accuracy import absolute_errors, relative_errors, root_mean_square
-from sceneslam.evaluation.files import read_poses
+from sceneslam.evaluation.files import has_stamps, read_poses
 from sceneslam.evaluation.relations import Relations, relation_errors
 from sceneslam.types.errors import ConfigError, InputError, SceneSlamError
 
@@ -30,6 +30,11 @@ def _ate(options: argparse.Namespace) -> dict[str, float | int | None]:
     if not 0 <= options.max_gap_s <= 1e9:
         raise ConfigError("--max-gap-s", options.max_gap_s, "0 to 1e9 [s]")
     estimate, truth = read_poses(options.estimate), read_poses(options.truth)
+    if has_stamps(options.estimate) != has_stamps(options.truth):
+        raise InputError(
+            "one file has stamps (TUM layout), the other has none (KITTI layout); score against "
+            f"the groundtruth.tum of the run: {options.estimate}, {options.truth}"
+        )
     absolute = absolute_errors(estimate, truth, options.max_gap_s)
     if not len(absolute.errors_m):
         raise InputError(
@@ -55,9 +60,15 @@ def _relations(options: argparse.Namespace) -> dict[str, float | int]:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m sceneslam.evaluation", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
-    ate = commands.add_parser("ate", help="absolute and relative error against a true trajectory")
+    ate = commands.add_parser(
+        "ate",
+        help="absolute and relative error against a true trajectory",
+        description="Both files have to hold poses of the same body frame: else the relative "
+        "error is wrong. trajectory.tum of a run holds those of `base`, and so does its "
+        "groundtruth.tum; the ground truth of TUM's recordings is of the camera's optical frame.",
+    )
     ate.add_argument("estimate", type=Path, help="TUM or KITTI file")
-    ate.add_argument("truth", type=Path, help="the same, true poses")
+    ate.add_argument("truth", type=Path, help="the same layout, true poses")
     ate.add_argument(
         "--max-gap-s", type=float, default=0.01, help="poses further apart do not match (0.01)"
     )

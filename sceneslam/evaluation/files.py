@@ -22,16 +22,17 @@ def read_poses(path: Path) -> Trajectory:
     """
     if not path.is_file():
         raise InputError(f"trajectory file not found: {path}")
-    first = _first_line(path)
-    trajectory = _read_kitti(path) if len(first.split()) == 12 else Trajectory.read_tum(path)
+    trajectory = Trajectory.read_tum(path) if has_stamps(path) else _read_kitti(path)
     if not len(trajectory):
         raise InputError(f"trajectory file holds no poses: {path}")
     return trajectory
 
 
-def _first_line(path: Path) -> str:
+def has_stamps(path: Path) -> bool:
+    """Tell whether a trajectory file has stamps, as in TUM layout; in KITTI layout it has none."""
     lines = read_text(path).splitlines()
-    return next((line for line in lines if line.strip() and line.lstrip()[0] != "#"), "")
+    first = next((line for line in lines if line.strip() and line.lstrip()[0] != "#"), "")
+    return len(first.split()) != 12
 
 
 def _read_kitti(path: Path) -> Trajectory:
