@@ -151,6 +151,25 @@ def test_run_of_hydras_own_launcher_is_read_too(tmp_path):
     assert [(row.status, row.keys["seed"]) for row in rows] == [("failed", 0), ("done", 1)]
 
 
+def test_run_outside_a_sweep_is_incomplete_where_its_results_are(tmp_path):
+    lacks = {"errors": ["interrupted"], "shortfalls": ["only 3 % of the observations got a pose"]}
+    figure = {"name": "drift", "value": 0.2}
+    files = [
+        {"metrics.json": metrics(0.1) | lacks},
+        {"metrics.json": metrics(0.1) | {"errors": [], "shortfalls": []}},
+        {"verdict.json": {"figures": [figure]}},
+    ]
+    for number, written in enumerate(files):
+        (tmp_path / str(number) / ".hydra").mkdir(parents=True)
+        (tmp_path / str(number) / ".hydra" / "overrides.yaml").write_text("[]")
+        for name, content in written.items():
+            (tmp_path / str(number) / name).write_text(json.dumps(content))
+    rows = read_rows(tmp_path)
+    assert [row.status for row in rows] == ["incomplete", "done", "done"]
+    assert rows[0].error == "interrupted; only 3 % of the observations got a pose"
+    assert rows[2].metrics["drift"] == 0.2
+
+
 @pytest.mark.parametrize(
     "text", ["010", "1:30", "0x1F", "1e-3", "-2.5E+3", ".5", "1_000", "7", "-0", "1.", "a.5", "e5"]
 )

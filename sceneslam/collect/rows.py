@@ -8,6 +8,7 @@ import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import yaml
 
@@ -74,11 +75,9 @@ def _runs(folder: Path) -> Iterator[Path]:
 
 
 def _row(root: Path, folder: Path) -> Row:
-    status = Status.read(folder)
-    path = folder / "metrics.json"
-    if status is None:  # a run of Hydra's own launchers, or a single one
-        state = State.DONE if path.is_file() else State.FAILED
-        status = Status(state=state, overrides=_overrides(folder))
+    status, path = Status.read(folder), folder / "metrics.json"
+    if status is None:
+        status = _unsupervised(folder)
     costs: dict[str, Value] = {}
     metrics: dict[str, Value] = {}
     if status.is_finished and path.is_file():
@@ -96,6 +95,18 @@ def _row(root: Path, folder: Path) -> Row:
         metrics=metrics,
         costs=costs,
     )
+
+
+def _unsupervised(folder: Path) -> Status:
+    """Return the status of a run of Hydra's own launchers, or of a single one, by its results."""
+    path, error = folder / "metrics.json", ""
+    if path.is_file():
+        metrics: Mapping[str, Any] = _json(path)
+        error = "; ".join([*metrics.get("errors", ()), *metrics.get("shortfalls", ())])
+        state = State.INCOMPLETE if error else State.DONE
+    else:
+        state = State.DONE if (folder / "verdict.json").is_file() else State.FAILED
+    return Status(state=state, error=error, overrides=_overrides(folder))
 
 
 def _figures(path: Path) -> dict[str, Value]:
