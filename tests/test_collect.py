@@ -115,6 +115,16 @@ def test_summary_says_how_many_runs_a_mean_is_over(sweep):
     assert page.count(" (2 of 3)</td>") == 5 and "(3 of 3)" not in page
 
 
+def test_run_that_was_repeated_with_its_seed_counts_once(sweep):
+    words = ("+scenario=flicker", "detector.threshold=60", "seed=0")
+    job(sweep, 6, *words, error_m=0.04)
+    main([str(sweep)])
+    first = table(sweep / "summary.csv")[0]
+    assert (first["runs"], first["ate_rmse_m runs"]) == ("3", "3")
+    assert float(first["ate_rmse_m"]) == pytest.approx((0.04 + 0.02 + 0.03) / 3)
+    assert len(table(sweep / "table.csv")) == 7
+
+
 @pytest.mark.parametrize(
     ("freedom", "t"),
     [(1, 12.7062), (2, 4.3027), (3, 3.1824), (4, 2.7764), (9, 2.2622), (30, 2.0423)],

@@ -24,7 +24,7 @@ class Mean:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Group:
-    """All rows that differ by their seed only."""
+    """The rows that differ by their seed only, one per seed."""
 
     keys: dict[str, Value]
     rows: Sequence[Row]
@@ -36,13 +36,17 @@ class Group:
 
 
 def groups_of(rows: Sequence[Row]) -> list[Group]:
-    """Return the groups, by the swept keys besides the seed, in the rows' order."""
+    """Return the groups, by the swept keys besides the seed, in the rows' order.
+
+    A run with a seed that its group has already is the same run again: the last one counts.
+    """
     keys = [key for key in swept_keys(rows) if key != SEED]
-    found: dict[tuple[Value, ...], list[Row]] = {}
+    found: dict[tuple[Value, ...], dict[Value, Row]] = {}
     for row in rows:
-        found.setdefault(tuple(row.keys.get(key) for key in keys), []).append(row)
+        group = found.setdefault(tuple(row.keys.get(key) for key in keys), {})
+        group[row.keys.get(SEED)] = row
     return [
-        Group(keys=dict(zip(keys, values, strict=True)), rows=group)
+        Group(keys=dict(zip(keys, values, strict=True)), rows=list(group.values()))
         for values, group in found.items()
     ]
 
