@@ -20,7 +20,14 @@ from sceneslam.collect.rows import Row, parsed, read_rows
 from sceneslam.collect.status import State, Status
 from sceneslam.collect.summary import groups_of, mean_of, student_t
 
-SWITCH = {"confirm_delay_s": 2.0, "gap_s": 0.0, "jump_m": 0.1, "jump_rad": None, "cost_ms": 3.0}
+SWITCH = {
+    "confirm_delay_s": 2.0,
+    "gap_s": 0.0,
+    "jump_m": 0.1,
+    "jump_rad": None,
+    "jump_is_error": True,
+    "cost_ms": 3.0,
+}
 
 
 def metrics(error_m, delay_s=1.0):
@@ -145,6 +152,13 @@ def test_switches_are_told_by_their_number_and_their_worst():
     assert numbers["switches"] == 2
     assert (numbers["confirm_delay_s"], numbers["confirm_delay_max_s"]) == (1.5, 2.0)
     assert numbers["switch_jump_max_rad"] is None
+
+
+def test_motion_of_the_pose_at_a_switch_is_no_jump():
+    moved = SWITCH | {"jump_m": 0.7, "jump_rad": 0.2, "jump_is_error": False}
+    numbers = flat({"switches": [SWITCH, moved]})
+    assert (numbers["switch_jump_max_m"], numbers["switch_jump_max_rad"]) == (0.1, None)
+    assert (numbers["switch_moved_max_m"], numbers["switch_moved_max_rad"]) == (0.7, 0.2)
 
 
 def test_front_is_what_nothing_else_beats():

@@ -95,8 +95,8 @@ def test_a_module_answers_for_the_light_it_is_meant_for_only(tmp_path, monkeypat
     ]
 
 
-def switched(*, switches=1, coverage=1.0):
-    switch = {"gap_s": 0.0, "jump_m": 0.01}
+def switched(*, switches=1, coverage=1.0, is_error=True):
+    switch = {"gap_s": 0.0, "jump_m": 0.01, "jump_is_error": is_error}
     return {
         "switches": [switch] * switches,
         "coverage": coverage,
@@ -124,7 +124,7 @@ def test_the_papers_own_switch_waits_for_its_start_but_ours_has_to_keep_the_boun
     def tell(trial):
         asked.append(trial.overrides)
         is_ours = trial.name == "rewind"
-        return Told(metrics=switched(coverage=1.0 if is_ours else 0.9))
+        return Told(metrics=switched(coverage=1.0 if is_ours else 0.9, is_error=is_ours))
 
     def run_trials(trials):
         for outcome in teller(tmp_path / "runs", tell)(trials):
@@ -137,6 +137,8 @@ def test_the_papers_own_switch_waits_for_its_start_but_ours_has_to_keep_the_boun
     )
     verdict = experiment.run(run_trials, tmp_path)
     assert verdict.holds and verdict.table.rows[0][-1] == 2.0
+    seam = verdict.table.columns.index("seam [cm]")
+    assert verdict.table.rows[0][seam] == 1.0 and np.isnan(verdict.table.rows[1][seam])
     assert asked[0] == ("policy.handover=rewind",)
     assert asked[1] == ("policy.handover=cold", "++policy.startup_s.dark=1.0")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -76,12 +77,13 @@ def _draw_map(outcome: TrialResult, path: Path) -> None:
 def _row(kind: str, outcome: TrialResult) -> tuple[str | float, ...]:
     metrics = outcome.metrics
     switches = metrics["switches"]
+    seams_m = [number(switch["jump_m"]) for switch in switches if switch["jump_is_error"]]
     return (
         kind,
         float(len(switches)),
         100 * number(metrics["coverage"]),
         max((number(switch["gap_s"]) for switch in switches), default=0.0),
-        100 * max((number(switch["jump_m"]) for switch in switches), default=0.0),
+        100 * max(seams_m, default=math.nan),
         100 * number(metrics["ate_rmse_m"]),
         100 * number(metrics["ate_max_m"]),
         _points(outcome.folder / "map" / "points.ply"),

@@ -13,6 +13,8 @@ _OF_SWITCHES: Sequence[tuple[str, str, Callable[[Sequence[float]], float]]] = (
     ("switch_gap_max_s", "gap_s", max),
     ("switch_jump_max_m", "jump_m", max),
     ("switch_jump_max_rad", "jump_rad", max),
+    ("switch_moved_max_m", "moved_m", max),
+    ("switch_moved_max_rad", "moved_rad", max),
     ("switch_cost_ms", "cost_ms", max),
 )
 
@@ -34,8 +36,14 @@ def flat(metrics: Mapping[str, object]) -> dict[str, Number]:
 
 def _switches(switches: Sequence[Mapping[str, object]]) -> dict[str, Number]:
     found: dict[str, Number] = {}
+    named = [switch if switch.get("jump_is_error") else _moved(switch) for switch in switches]
     for name, entry, summary in _OF_SWITCHES:
-        values = [switch.get(entry) for switch in switches]
+        values = [switch.get(entry) for switch in named]
         known = [float(value) for value in values if isinstance(value, int | float)]
         found[name] = summary(known) if known else None
     return found
+
+
+def _moved(switch: Mapping[str, object]) -> Mapping[str, object]:
+    """Return a switch whose jump is no error but how far the current pose moved."""
+    return {name.replace("jump_", "moved_"): value for name, value in switch.items()}
