@@ -20,11 +20,13 @@ from sceneslam.ros import decode
 from sceneslam.ros.encode_results import ResultEncoder
 from sceneslam.ros.messages import MessageDecoder, TopicType
 from sceneslam.ros.transport.transport import Arrival
+from sceneslam.sinks.live_map import NOTHING
 from sceneslam.sinks.ros2 import requests, topics
 from sceneslam.sinks.ros2 import sink as under_test
 from sceneslam.types import se3
 from sceneslam.types.command import Pause, SaveMap, SelectModule, SelectScene
 from sceneslam.types.errors import ConfigError
+from sceneslam.types.maps import GridLayer
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Laser, Rig, Sensor
 
@@ -238,7 +240,14 @@ def test_grid_shows_the_wall_where_the_scan_met_it(air, sink):
     origin = message.info.origin.position
     column = int((3.0 - origin.x) / message.info.resolution)  # a metre ahead of the first place
     row = int((0.0 - origin.y) / message.info.resolution)
-    assert grid[row, column - 10] < 50 and grid.max() > 50 and grid.min() == -1
+    assert grid[row, column - 10] < 50 and grid.max() == 100 and grid.min() == -1
+
+
+def test_walls_are_100_as_nav2_wants_them_free_is_0_and_the_rest_unknown(air, sink):
+    log_odds = np.array([[3.5, 0.63, 0.61], [0.0, -1.4, -1.42]], np.float32)
+    layer = GridLayer(log_odds=log_odds, resolution_m=0.05, origin_xy_m=(0.0, 0.0))
+    sink._publish_map(replace(NOTHING, grid=layer))
+    assert list(air.last("/map").data) == [100, 100, -1, -1, -1, 0]
 
 
 def test_initial_pose_moves_the_map_under_the_robot(air, sink):

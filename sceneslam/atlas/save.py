@@ -12,10 +12,15 @@ from numpy.typing import NDArray
 from sceneslam.types import se3
 from sceneslam.types.covariance import triangle
 from sceneslam.types.files import replacing
-from sceneslam.types.maps import GridLayer, HybridMap, PoseGraphLayer
+from sceneslam.types.maps import (
+    FREE_THRESHOLD,
+    OCCUPIED_THRESHOLD,
+    GridLayer,
+    HybridMap,
+    PoseGraphLayer,
+)
 from sceneslam.types.trajectory import Trajectory
 
-OCCUPIED_THRESHOLD, FREE_THRESHOLD = 0.65, 0.196  # map_server's own defaults
 _PLY_TYPES = {
     "float32": ("<f4", "float"),
     "float64": ("<f8", "double"),
@@ -78,11 +83,8 @@ def save_pose_graph(graph: PoseGraphLayer, path: Path) -> None:
 
 def save_grid(grid: GridLayer, path: Path) -> None:
     """Write the grid for map_server: black occupied, white free, grey unknown; y points up."""
-    occupied = 1.0 / (1.0 + np.exp(-grid.log_odds.astype(np.float64)))
-    image = np.full(grid.log_odds.shape, 205, np.uint8)
-    image[occupied > OCCUPIED_THRESHOLD] = 0
-    image[occupied < FREE_THRESHOLD] = 254
-    rows, columns = grid.log_odds.shape
+    image = grid.trinary(occupied=0, free=254, unknown=205).astype(np.uint8)
+    rows, columns = image.shape
     with replacing(path.with_suffix(".pgm"), "wb") as file:
         file.write(f"P5\n{columns} {rows}\n255\n".encode())
         file.write(np.flipud(image).tobytes())

@@ -29,10 +29,12 @@ class ResultEncoder(Encoder):
         return head + _poses(stamps_ns, T_frame_base, frame, begins_at=len(head) - _CDR_HEADER)
 
     def grid(self, stamp_ns: int, grid: GridLayer, T_frame_map: Transform, frame: str) -> bytes:
-        """Return an OccupancyGrid: 0 to 100 per cent occupied, -1 unknown."""
-        occupied = 1.0 / (1.0 + np.exp(-grid.log_odds.astype(np.float32)))
-        percent = np.where(grid.log_odds == 0, -1, np.rint(100 * occupied)).astype(np.int8)
-        rows, columns = percent.shape
+        """Return an OccupancyGrid of 100 (occupied), 0 (free) and -1 (unknown), as map_server's.
+
+        Nav2 takes all from 0 to 99 as free.
+        """
+        cells = grid.trinary(occupied=100, free=0, unknown=-1).astype(np.int8)
+        rows, columns = cells.shape
         T_map_corner = se3.from_xy_yaw(*grid.origin_xy_m, 0.0)
         stamp = self._header(stamp_ns, frame).stamp
         return self._cdr(
@@ -46,7 +48,7 @@ class ResultEncoder(Encoder):
                 height=rows,
                 origin=self._pose(T_frame_map @ T_map_corner),
             ),
-            data=percent.ravel(),
+            data=cells.ravel(),
         )
 
     def cloud(self, stamp_ns: int, layer: PointLayer, T_frame_map: Transform, frame: str) -> bytes:

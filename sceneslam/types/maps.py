@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+OCCUPIED_THRESHOLD, FREE_THRESHOLD = 0.65, 0.196  # map_server's own defaults
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PointLayer:
@@ -23,6 +25,16 @@ class GridLayer:
     log_odds: NDArray[np.float32]  # (rows, columns)
     resolution_m: float
     origin_xy_m: tuple[float, float]  # outer corner of cell (0, 0)
+
+    def trinary(self, *, occupied: int, free: int, unknown: int) -> NDArray[np.int16]:
+        """Return a value per cell (rows, columns), as map_server tells them apart.
+
+        A cell between both thresholds is unknown.
+        """
+        values = np.full(self.log_odds.shape, unknown, np.int16)
+        values[self.log_odds > _log_odds(OCCUPIED_THRESHOLD)] = occupied
+        values[self.log_odds < _log_odds(FREE_THRESHOLD)] = free
+        return values
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -96,3 +108,7 @@ class HybridMap:
     pose_graph: PoseGraphLayer | None = None  # of the submaps of all modules
     landmarks: LandmarkLayer | None = None
     landmark_modules: NDArray[np.uint8] | None = None  # (N,), as `point_modules`
+
+
+def _log_odds(probability: float) -> float:
+    return float(np.log(probability / (1.0 - probability)))

@@ -86,8 +86,8 @@ def _read(heard):
         "tf_count": len(heard["/tf"]),
         "map": {
             "count": len(grids),
-            "occupied": sum(cell > 50 for cell in cells),
-            "free": sum(0 <= cell < 50 for cell in cells),
+            "occupied": sum(cell == 100 for cell in cells),
+            "free": sum(cell == 0 for cell in cells),
         },
         "points": max((one.width * one.height for one in messages["/sceneslam/points"]), default=0),
         "scenes": [one.data for one in messages["/sceneslam/scene"]],
