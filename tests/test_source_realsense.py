@@ -17,6 +17,7 @@ from sceneslam.types.rig import Sensor
 rs = pytest.importorskip("pyrealsense2", reason="the extra realsense is not installed")
 
 from sceneslam.sources.realsense import device as under_test  # noqa: E402
+from sceneslam.sources.realsense import source as source_module  # noqa: E402
 from sceneslam.sources.realsense.distortion import to_opencv  # noqa: E402
 from sceneslam.sources.realsense.source import RealSense  # noqa: E402
 
@@ -223,6 +224,27 @@ def test_camera_whose_images_stall_while_its_imu_goes_on_is_opened_again(make):
     assert next(observations, None) is None
     thread.join()
     assert is_reopened.is_set()
+
+
+def test_camera_that_opens_slowly_has_time_to_give_an_image(make, monkeypatch):
+    now_ns, opened_ns = [10**12], []
+    source = make(SoftwareCamera(), silent_after_s=1.0)
+    source_open = source._opener
+
+    def open_slowly(serial, wanted):
+        now_ns[0] += 3000 * MS
+        opened_ns.append(now_ns[0])
+        return source_open(serial, wanted)
+
+    def wait(timeout_s):
+        now_ns[0] += round(timeout_s * 1e9)
+        if len(opened_ns) == 3:
+            source.close()
+
+    monkeypatch.setattr(source_module, "monotonic_ns", lambda: now_ns[0])
+    source._opener, source._waiting.take = open_slowly, wait
+    assert not list(source)
+    assert np.diff(opened_ns).min() > 4000 * MS
 
 
 def test_size_that_the_camera_lacks_is_named_with_what_it_has(make):

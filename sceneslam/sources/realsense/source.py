@@ -110,8 +110,8 @@ class RealSense(Measuring):
             streams.look(now_ns, stamp_ns)
             streams.drop(self._waiting.take_dropped(), now_ns, stamp_ns)
             if now_ns - seen_ns > self._silent_after_s * 1e9 and not self._waiting.is_closed:
-                seen_ns = now_ns
                 device = self._device = self._reopened(device)
+                seen_ns = monotonic_ns()
 
     def _reopened(self, device: OpenCamera) -> OpenCamera:
         """Return the reopened camera; the old one if it is not available."""
