@@ -20,6 +20,7 @@ from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
+from sceneslam.collect.rows import read_rows
 from sceneslam.collect.status import State, Status
 from sceneslam.config.check import check_keys, check_maps_apart
 from sceneslam.storage.folder import RunFolder
@@ -212,6 +213,14 @@ def test_table_holds_no_job_of_an_earlier_command(tmp_path, capsys):
     run_sweep(tmp_path, folders[:2], {"backend": "basic"}, tmp_path)
     assert [row["job"] for row in table(tmp_path)] == ["0", "1"]
     assert main([str(tmp_path)]) == 0 and "2 jobs: 2 done" in capsys.readouterr().out
+
+
+def test_sweep_takes_no_rows_of_an_earlier_one_of_the_detection_alone(folder):
+    words = (*JOBS[:3], "policy.confirm_window_s=1", "hydra.sweep.dir=out")
+    assert sweep(folder, *words, "run=detect_only")[0] == 0
+    assert [row.status for row in read_rows(folder / "out")] == ["done"]
+    sweep(folder, *words, JOBS[3], "policy.retry_s=-1")
+    assert [row.status for row in read_rows(folder / "out")] == ["failed"]
 
 
 def test_running_sweep_does_not_see_later_edits(folder):

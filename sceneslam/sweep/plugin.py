@@ -23,6 +23,7 @@ from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
+from sceneslam.collect.rows import ROWS
 from sceneslam.collect.status import State, Status
 from sceneslam.config.check import check_maps_apart
 from sceneslam.config.resolve import without_hydra
@@ -65,6 +66,7 @@ class SweepLauncher(Launcher):
         check_maps_apart(map(_maps, configs))
         for folder, config in zip(folders, configs, strict=True):
             _prepare(folder, config)
+        (sweep / ROWS).unlink(missing_ok=True)  # of an earlier sweep of the detection alone
         run_sweep(sweep, folders, self._launcher, Path.cwd())
         return [_returned(*pair) for pair in zip(folders, configs, strict=True)]
 
