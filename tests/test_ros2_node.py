@@ -257,7 +257,10 @@ def listened(T_world_grid):
     topics = NONE | {"pose": "/pose", "map": "/map"}
     listener = NodeListener(transport, {"topics": topics, "pose_kind": "pose", "map_kind": "grid"})
     cell = GridLayer(log_odds=np.ones((1, 1)), resolution_m=0.05, origin_xy_m=(0.0, 0.0))
-    cdr = ResultEncoder().grid(0, cell, T_world_grid, "map")
+    encoder, kind = ResultEncoder(), "nav_msgs/msg/OccupancyGrid"
+    message = encoder._store.deserialize_cdr(encoder.grid(0, cell, "map"), kind)
+    message.info.origin = encoder._pose(T_world_grid)
+    cdr = bytes(encoder._store.serialize_cdr(message, kind))
     heard["/map"](Arrival(topic="/map", cdr=cdr, arrived_ns=0))
     return listener.map()
 

@@ -250,25 +250,51 @@ def test_walls_are_100_as_nav2_wants_them_free_is_0_and_the_rest_unknown(air, si
     assert list(air.last("/map").data) == [100, 100, -1, -1, -1, 0]
 
 
-def test_initial_pose_moves_the_map_under_the_robot(air, sink):
+def draw_arrow(air, T_frame_base):
     encoder = ResultEncoder()
-    T_map_base, T_said = at(2.0, 0.0, 0.1), at(10.0, 5.0, 1.0)
     message = encoder._new(
         "geometry_msgs/msg/PoseWithCovarianceStamped",
         header=encoder._header(0, "map"),
         pose=encoder._new(
             "geometry_msgs/msg/PoseWithCovariance",
-            pose=encoder._pose(T_said),
+            pose=encoder._pose(T_frame_base),
             covariance=np.zeros(36),
         ),
     )
     cdr = bytes(encoder._store.serialize_cdr(message, message.__msgtype__))
     air.ask(requests.INITIAL_POSE, cdr)
+
+
+def test_initial_pose_moves_the_map_under_the_robot(air, sink):
+    T_map_base, T_said = at(2.0, 0.0, 0.1), at(10.0, 5.0, 1.0)
+    draw_arrow(air, T_said)
     for x_m in (2.0, 3.0):
         sink.write(seen(S, at(0.0)), at(x_m, 0.0, 0.1), "laser")
         _, _, T_frame_odom, _ = transform(air.last("/tf"))
         expected = T_said @ se3.inverse(T_map_base) @ at(x_m, 0.0, 0.1)
         np.testing.assert_allclose(T_frame_odom, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("yaw_rad", [0.0, 1.0, -2.5])
+def test_grid_lies_along_the_axes_of_the_frame_that_an_arrow_has_turned(air, sink, yaw_rad):
+    T_frame_map = at(10.0, -5.0, yaw_rad)
+    draw_arrow(air, T_frame_map)
+    sink.write(seen(S, at(0.0)), at(0.0), "laser")
+    log_odds = np.full((40, 60), -2.0, np.float32)
+    walls = np.array([[5, 7], [20, 30], *([30, column] for column in range(60))])
+    log_odds[tuple(walls.T)] = 2.0
+    layer = GridLayer(log_odds=log_odds, resolution_m=0.05, origin_xy_m=(1.0, 2.0))
+    sink._publish_map(replace(NOTHING, grid=layer))
+    info, data = air.last("/map").info, air.last("/map").data
+    turn, corner = info.origin.orientation, info.origin.position
+    assert (turn.x, turn.y, turn.z, turn.w) == (0.0, 0.0, 0.0, 1.0)
+    cells = np.reshape(data, (info.height, info.width))
+    found = (np.argwhere(cells == 100)[:, ::-1] + 0.5) * info.resolution + [corner.x, corner.y]
+    centres = (walls[:, ::-1] + 0.5) * 0.05 + [1.0, 2.0]
+    expected = centres @ T_frame_map[:2, :2].T + T_frame_map[:2, 3]
+    apart_m = np.linalg.norm(found[:, None] - expected, axis=2)
+    assert apart_m.min(axis=0).max() < 0.05 and apart_m.min(axis=1).max() < 0.05
+    assert abs(np.count_nonzero(cells == 0) - np.count_nonzero(log_odds < 0)) < 60
 
 
 def test_operators_wishes_become_commands(air, sink):

@@ -6,12 +6,12 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.scans.occupancy_grid import drawn, walls
 from sceneslam.types import se3
+from sceneslam.types.grid_frames import grid_corners, resampled
 from sceneslam.types.maps import (
     GridLayer,
     HybridMap,
@@ -100,7 +100,7 @@ def _grids(one: Placed) -> list[_PlacedGrid]:
     if scans is not None and one.T_map_laser is not None:
         found.append((se3.identity(), drawn(scans, one.T_map_laser)))
     return [
-        _PlacedGrid(module=one.module, T_map_local=T, layer=grid, corners=_corners_map(T, grid))
+        _PlacedGrid(module=one.module, T_map_local=T, layer=grid, corners=grid_corners(T, grid))
         for T, grid in found
         if grid.log_odds.size
     ]
@@ -176,40 +176,6 @@ def _fuse_grids(placed: Sequence[_PlacedGrid]) -> GridLayer | None:
     origin_xy_m = (float(low[0] * resolution_m), float(low[1] * resolution_m))
     total = np.zeros((rows, columns), np.float32)
     for one in placed:
-        total += _resample(one.T_map_local, one.layer, origin_xy_m, resolution_m, (columns, rows))
+        total += resampled(one.T_map_local, one.layer, origin_xy_m, resolution_m, (columns, rows))
     np.clip(total, -_LOG_ODDS_LIMIT, _LOG_ODDS_LIMIT, out=total)
     return GridLayer(log_odds=total, resolution_m=resolution_m, origin_xy_m=origin_xy_m)
-
-
-@np.errstate(over="ignore", invalid="ignore")
-def _corners_map(T_map_local: Transform, grid: GridLayer) -> NDArray[np.float64]:
-    rows, columns = grid.log_odds.shape
-    low = np.array(grid.origin_xy_m)
-    high = low + grid.resolution_m * np.array([columns, rows])
-    corners = np.array([[low[0], low[1]], [low[0], high[1]], [high[0], low[1]], [*high]])
-    T = _planar(T_map_local)
-    return np.asarray(corners @ T[:2, :2].T + T[:2, 3])
-
-
-def _resample(
-    T_map_local: Transform,
-    grid: GridLayer,
-    origin_xy_m: tuple[float, float],
-    resolution_m: float,
-    size_wh: tuple[int, int],
-) -> NDArray[np.float32]:
-    """Return the grid's log odds at the centres of the map's cells (nearest cell)."""
-    T = se3.inverse(_planar(T_map_local))
-    # Cell indices of the map -> metres in map -> metres in local -> cell indices of the grid.
-    scale = resolution_m / grid.resolution_m
-    centre = np.array(origin_xy_m) + resolution_m / 2
-    offset = T[:2, :2] @ centre + T[:2, 3] - np.array(grid.origin_xy_m) - grid.resolution_m / 2
-    affine = np.column_stack([scale * T[:2, :2], offset / grid.resolution_m])
-    flags = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
-    log_odds = grid.log_odds.astype(np.float32, copy=False)  # OpenCV knows few types
-    return np.asarray(cv2.warpAffine(log_odds, affine, size_wh, flags=flags))
-
-
-def _planar(T_map_local: Transform) -> Transform:
-    """Return the planar part (x, y, yaw) of a transform."""
-    return se3.from_xy_yaw(T_map_local[0, 3], T_map_local[1, 3], se3.yaw_rad(T_map_local))

@@ -28,14 +28,13 @@ class ResultEncoder(Encoder):
         head = empty[: -_COUNT.itemsize] + np.array(len(stamps_ns), _COUNT).tobytes()
         return head + _poses(stamps_ns, T_frame_base, frame, begins_at=len(head) - _CDR_HEADER)
 
-    def grid(self, stamp_ns: int, grid: GridLayer, T_frame_map: Transform, frame: str) -> bytes:
+    def grid(self, stamp_ns: int, grid: GridLayer, frame: str) -> bytes:
         """Return an OccupancyGrid of 100 (occupied), 0 (free) and -1 (unknown), as map_server's.
 
         Nav2 takes all from 0 to 99 as free.
         """
         cells = grid.trinary(occupied=100, free=0, unknown=-1).astype(np.int8)
         rows, columns = cells.shape
-        T_map_corner = se3.from_xy_yaw(*grid.origin_xy_m, 0.0)
         stamp = self._header(stamp_ns, frame).stamp
         return self._cdr(
             "nav_msgs/msg/OccupancyGrid",
@@ -46,7 +45,7 @@ class ResultEncoder(Encoder):
                 resolution=grid.resolution_m,
                 width=columns,
                 height=rows,
-                origin=self._pose(T_frame_map @ T_map_corner),
+                origin=self._pose(se3.from_xy_yaw(*grid.origin_xy_m, 0.0)),
             ),
             data=cells.ravel(),
         )

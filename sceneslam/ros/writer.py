@@ -102,12 +102,11 @@ class ObservationWriter:
         poses = list(trajectory.T_world_base)
         path = self._encoder.path(trajectory.stamps_ns.tolist(), poses, names.MAP)
         self._add(names.RESULT_PATH, at_ns, path)
-        here = np.eye(4)
         if result.map.grid is not None:
-            grid = self._encoder.grid(at_ns, result.map.grid, here, names.MAP)
+            grid = self._encoder.grid(at_ns, result.map.grid, names.MAP)
             self._add(names.RESULT_MAP, at_ns, grid)
         if len(result.map.points.points):
-            cloud = self._encoder.cloud(at_ns, result.map.points, here, names.MAP)
+            cloud = self._encoder.cloud(at_ns, result.map.points, np.eye(4), names.MAP)
             self._add(names.RESULT_POINTS, at_ns, cloud)
 
     def write_module(self, stamp_ns: int, module: str) -> None:

@@ -17,6 +17,7 @@ from sceneslam.sinks.ros2.requests import Requests
 from sceneslam.types import se3
 from sceneslam.types.command import Command, SaveMap
 from sceneslam.types.errors import ConfigError
+from sceneslam.types.grid_frames import in_frame
 from sceneslam.types.maps import HybridMap
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig, Sensor
@@ -221,7 +222,8 @@ class TopicSink:
         stamp_ns = self._stamps_ns[-1] if self._stamps_ns else 0
         T_frame_map, frame = self._T_frame_map, self._map_frame
         if hybrid.grid is not None and hybrid.grid.log_odds.size:
-            self.send(MAP, self.encoder.grid(stamp_ns, hybrid.grid, T_frame_map, frame))
+            grid = in_frame(T_frame_map, hybrid.grid)  # Nav2 ignores an origin's rotation
+            self.send(MAP, self.encoder.grid(stamp_ns, grid, frame))
         if len(hybrid.points.points):
             self.send(POINTS, self.encoder.cloud(stamp_ns, hybrid.points, T_frame_map, frame))
 
