@@ -132,6 +132,19 @@ def test_run_that_was_repeated_with_its_seed_counts_once(sweep):
     assert len(table(sweep / "table.csv")) == 7
 
 
+def test_reason_that_a_run_did_not_have_counts_as_zero(tmp_path):
+    counts = [{"while rgbd was lost": 9}, {}, {}]
+    for seed, missing in enumerate(counts):
+        path = job(tmp_path, seed, f"seed={seed}", error_m=0.1)
+        told = metrics(0.1) | {"bridged": 0, "bridged_why": {}, "missing_why": missing}
+        (path / "metrics.json").write_text(json.dumps(told))
+    job(tmp_path, 3, "seed=3", state=State.KILLED)
+    main([str(tmp_path)])
+    (one,) = table(tmp_path / "summary.csv")
+    name = "missing_why.while rgbd was lost"
+    assert (one[name], one[f"{name} runs"]) == ("3.0", "3")
+
+
 @pytest.mark.parametrize(
     ("freedom", "t"),
     [(1, 12.7062), (2, 4.3027), (3, 3.1824), (4, 2.7764), (9, 2.2622), (30, 2.0423)],

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import logging
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from sceneslam.collect.page import write_page
@@ -14,6 +14,8 @@ from sceneslam.collect.summary import Group, groups_of
 from sceneslam.types.files import replacing
 
 _log = logging.getLogger(__name__)
+
+_REASONS = ("bridged_why.", "missing_why.")  # of poses; a run's metrics hold counts above 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,13 +41,25 @@ def write_rows(folder: Path, rows: Sequence[Row]) -> Path:
     `table` holds deterministic metrics, which are the same for every launcher. Measured times are
     in `costs`.
     """
-    keys = swept_keys(rows)
+    rows, keys = _with_zeros(rows), swept_keys(rows)
     _write_csv(folder / "table.csv", _table(rows, keys, metrics=True))
     _write_csv(folder / "costs.csv", _table(rows, keys, metrics=False))
     groups = groups_of(rows)
     _write_csv(folder / "summary.csv", _summary(groups))
     _write_parquet(folder / "table.parquet", _table(rows, keys, metrics=True))
     return write_page(folder, rows, groups)
+
+
+def _with_zeros(rows: Sequence[Row]) -> list[Row]:
+    """Return the rows with 0 for every reason that a run lacks, so that means count it."""
+    names = [name for row in rows for name in row.metrics if name.startswith(_REASONS)]
+    reasons = dict.fromkeys(names)
+    filled = []
+    for row in rows:
+        is_counted = "bridged" in row.metrics  # by every run with SLAM
+        zeros = {name: 0 for name in reasons if is_counted and name not in row.metrics}
+        filled.append(replace(row, metrics={**row.metrics, **zeros}))
+    return filled
 
 
 def _table(rows: Sequence[Row], keys: Sequence[str], *, metrics: bool) -> ColumnTable:
