@@ -260,6 +260,16 @@ def test_a_damaged_sqlite_bag_is_one_sentence(shared_data: Path, tmp_path: Path)
         list(make_source("rosbag", folder))
 
 
+def test_an_sqlite_folder_without_metadata_says_how_to_get_it(
+    shared_data: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "drive 1"
+    copytree(shared_data / "bags" / "hokuyo_scan_db3", folder)
+    (folder / "metadata.yaml").unlink()
+    with pytest.raises(InputError, match=rf"`ros2 bag reindex '{folder}' -s sqlite3`"):
+        make_source("rosbag", folder)
+
+
 @pytest.mark.parametrize("odd", ["#", "?", "%20"])
 def test_a_character_that_no_path_of_an_sqlite_bag_may_have_is_named(
     shared_data: Path, tmp_path: Path, odd: str

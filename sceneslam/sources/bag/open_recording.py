@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections import deque
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -48,6 +49,9 @@ def _open_folder(path: Path) -> Recording:
     metadata = path / "metadata.yaml"
     if files and not _packs_messages(metadata):
         return open_mcap(files)
+    if not metadata.is_file() and files_by_number(path, {".db3"}):
+        how = f"ros2 bag reindex {shlex.quote(str(path))} -s sqlite3"
+        raise InputError(f"recording: its metadata.yaml is missing; write it by `{how}`: {path}")
     if not metadata.is_file():
         raise InputError(f"recording: the folder has neither metadata.yaml nor *.mcap: {path}")
     return FolderRecording(path)
