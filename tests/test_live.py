@@ -124,6 +124,23 @@ def test_recording_that_is_read_too_slowly_is_played_later_and_says_so():
     assert behind["by_s"] == pytest.approx(1.1, abs=0.3)
 
 
+def test_reading_is_no_latency_before_the_playback_is_delayed_either():
+    def slow():
+        for observation in observations(36, 30_000_000):
+            threading.Event().wait(0.036)
+            yield observation
+
+    def step(observation):
+        threading.Event().wait(0.002)
+        return True
+
+    run = Run(slow(), settings=LiveSettings(rate=10.0), step=step)  # every 3 ms
+    assert len(run.tally.latencies_ms) == 36
+    assert 2.0 <= np.median(run.tally.latencies_ms) < 50.0
+    behind = next(one for one in run.events if one["event"] == "behind")
+    assert behind["by_s"] == pytest.approx(1.0, abs=0.2)
+
+
 def test_slowest_pose_is_kept_with_what_its_time_went_to():
     def step(observation):
         threading.Event().wait(0.1)

@@ -107,7 +107,7 @@ class _LiveRun:
         self.tally, self._errors = LiveTally(), list[BaseException]()
         self._lag_ns: int | None = None  # clock - stamp / rate, of the first observation
         self._last_ns = 0
-        self._due_at_ns: dict[int, int] = {}  # stamp -> due time of queued observations
+        self._due_at_ns: dict[int, int] = {}  # stamp -> time from which the latency counts
         self._came_at_ns: dict[int, int] = {}  # stamp -> time of queueing
         self._behind_s = self._told_behind_s = 0.0  # delay of playback
 
@@ -169,8 +169,8 @@ class _LiveRun:
     def _await(self, observation: Observation) -> bool:
         """Wait until a recorded observation is due; return whether the run continues.
 
-        If the recording is read too slowly, its playback is delayed from then on: reading time is
-        not part of the latency.
+        If the recording is read too slowly, its playback is delayed from then on. Latency counts
+        from when an observation is due, or from when it has been read if that is later.
         """
         elapsed_ns, now_ns = round(observation.stamp_ns / self._settings.rate), monotonic_ns()
         if self._lag_ns is None:
@@ -179,7 +179,7 @@ class _LiveRun:
         if behind_s > _BEHIND_S:
             self._lag_ns = now_ns - elapsed_ns
             self._behind_s += behind_s
-        self._due_at_ns[observation.stamp_ns] = elapsed_ns + self._lag_ns
+        self._due_at_ns[observation.stamp_ns] = max(elapsed_ns + self._lag_ns, now_ns)
         return not self._is_over.wait(max(-behind_s, 0.0))
 
     def _work(self) -> None:
