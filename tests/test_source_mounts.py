@@ -112,6 +112,19 @@ def test_of_several_robots_the_one_whose_topics_are_used_places_its_sensors(
     assert source.rig.laser.T_base_laser[0, 3] == x_m
 
 
+@pytest.mark.parametrize("robot", ["robot1", "uav1"])
+def test_frames_of_the_robots_own_namespace_hold_before_those_without_one(
+    tmp_path: Path, robot: str
+) -> None:
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        for topic, at_m in (("/tf_static", 0.1), (f"/{robot}/tf_static", 0.2)):
+            tree = [recorder.transform("base_link", "laser", at_m)]
+            recorder.add(topic, 0, recorder.new("tf2_msgs/msg/TFMessage", transforms=tree))
+        recorder.scan(f"/{robot}/scan", STAMP_NS, [1.0, 2.0], frame="laser")
+    source = make_source("mcap", tmp_path / "a.mcap")
+    assert source.rig.laser.T_base_laser[0, 3] == 0.2
+
+
 @pytest.mark.parametrize("robots", [("chassis",), ("one/base_link", "two/base_link")])
 def test_a_laser_without_a_known_base_is_named_where_there_are_transforms(
     tmp_path: Path, robots: tuple[str, ...]

@@ -35,6 +35,8 @@ TYPES = {
     names.TF_STATIC: "tf2_msgs/msg/TFMessage",
     "/husky/scan": "sensor_msgs/msg/LaserScan",
     "/husky/tf_static": "tf2_msgs/msg/TFMessage",
+    "/uav1/scan": "sensor_msgs/msg/LaserScan",
+    "/uav1/tf_static": "tf2_msgs/msg/TFMessage",
     "/chatter": "std_msgs/msg/String",
 }
 CAMERA = Camera(size_wh=(8, 6), fx=5.0, fy=5.0, cx=4.0, cy=3.0)
@@ -48,13 +50,14 @@ class Robot:
         self.encoder, self._heard, self.is_closed = Encoder(), {}, False
         self.qos = {}
         self.mounts = {names.LASER: T_BASE_LASER, names.CAMERA: se3.identity()}
+        self.root_mounts, self.root_is_latched = None, True
         self._topics = {topic: TYPES[topic] for topic in topics}
         for topic in topics:  # what serialises a type is made at its first message
             self._message(self.encoder, topic, 0)
 
     def publications(self):
         return [
-            Publication(topic=topic, msgtype=kind, is_latched=topic.endswith(names.TF_STATIC))
+            Publication(topic=topic, msgtype=kind, is_latched=self._is_latched(topic))
             for topic, kind in self._topics.items()
         ]
 
@@ -84,6 +87,10 @@ class Robot:
         for topic in [one for one in self._topics if one not in without]:
             self.send(topic, self._message(self.encoder, topic, stamp_ns), **how)
 
+    def _is_latched(self, topic):
+        is_root = topic == names.TF_STATIC
+        return self.root_is_latched if is_root else topic.endswith(names.TF_STATIC)
+
     def _message(self, encoder, topic, stamp_ns):
         if topic == "/odom":
             x_m = stamp_ns / S
@@ -96,7 +103,9 @@ class Robot:
         if topic == INFO:
             return encoder.camera_info(stamp_ns, CAMERA)
         if topic.endswith(names.TF_STATIC):
-            return encoder.transforms(stamp_ns, names.BASE, self.mounts)
+            is_root = topic == names.TF_STATIC
+            mounts = self.root_mounts if is_root and self.root_mounts else self.mounts
+            return encoder.transforms(stamp_ns, names.BASE, mounts)
         if topic == IMAGE:
             return encoder.image(stamp_ns, np.full((6, 8, 3), 7, np.uint8), "bgr8")
         return encoder.image(stamp_ns, np.full((6, 8, 1), 2000, np.uint16), "16UC1")
@@ -327,6 +336,24 @@ def test_robot_in_a_namespace_has_its_own_transforms(make):
     robot.send("/husky/tf_static", robot.encoder.transforms(1, names.BASE, moved))
     source.close()
     assert [one["event"] for one in source.notices()] == ["tf_changed"]
+
+
+def test_two_robots_that_name_a_frame_alike_move_nothing(make):
+    robot = Robot(names.TF_STATIC, "/uav1/tf_static", "/uav1/scan")
+    robot.root_mounts = {names.LASER: se3.identity()}
+    source = make(robot)
+    np.testing.assert_allclose(heard(source, robot).laser.T_base_laser, T_BASE_LASER)
+    robot.measure(1, without=("/uav1/scan",))
+    source.close()
+    assert not list(source.notices())
+
+
+def test_every_topic_of_transforms_has_to_be_latched(make):
+    robot = Robot(names.TF_STATIC, "/uav1/tf_static", "/uav1/scan")
+    robot.root_is_latched = False
+    source = make(robot)
+    heard(source, robot)
+    assert ["transient local" in one for one in source.survey().odd] == [True]
 
 
 def test_transforms_that_move_or_come_late_are_named(make):

@@ -19,7 +19,7 @@ class FrameTree:
     """The transforms of /tf_static; for frames that are missing there, the first ones of /tf.
 
     Both may be in a robot's namespace. Where several robots name their frames alike, those of the
-    namespace of the topics `used` hold.
+    innermost namespace of the topics `used` hold.
     """
 
     def __init__(
@@ -27,7 +27,7 @@ class FrameTree:
     ) -> None:
         self._up: dict[str, tuple[str, Transform]] = {}  # child -> parent, T_parent_child
         topics = sorted(filter(is_of_transforms, recording.topics))
-        topics.sort(key=lambda topic: (not is_static(topic), not is_beside(topic, used)))
+        topics.sort(key=lambda one: (not is_static(one), not is_beside(one, used), -one.count("/")))
         for topic in topics:
             count = None if is_static(topic) else _FIRST_MOVING
             for message in islice(recording.messages({topic}), count):

@@ -35,7 +35,7 @@ class LiveRecording:
         self.topics: dict[str, TopicType] = {}
         self.announced: dict[str, str] = {}  # topic -> type
         self.other_types: dict[str, str] = {}  # topic -> what is published there too
-        self.is_latched = True  # /tf_static, where it is announced
+        self.is_latched = True  # every /tf_static that is announced
         self.metadata: Mapping[str, Mapping[str, str]] = {}
         self.faults: Sequence[str] = ()
         self._held: dict[str, deque[Message]] = {}
@@ -91,8 +91,9 @@ class LiveRecording:
             return Qos.SENSOR
         if not is_static(topic):
             return Qos.RELIABLE
-        self.is_latched = any(one.is_latched for one in publications)
-        return Qos.HISTORY if self.is_latched else Qos.RELIABLE
+        is_latched = any(one.is_latched for one in publications)
+        self.is_latched &= is_latched
+        return Qos.HISTORY if is_latched else Qos.RELIABLE
 
     def take(self, arrival: Arrival) -> None:
         """Add a message; beyond the limits, the oldest are dropped."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 from sceneslam.ros import decode
 from sceneslam.ros.messages import MessageDecoder, TopicType
 from sceneslam.ros.transport.transport import Arrival, Publication, Qos, Transport
+from sceneslam.sources.bag.recording import Message
 from sceneslam.types.errors import InputError
 from sceneslam.types.rig import Camera
 from sceneslam.types.se3 import Transform
@@ -29,7 +30,7 @@ class NetworkWatch:
         *,
         camera_info: str | None,
         mounts: Collection[str],
-        known: Sequence[Any],
+        known: Iterable[Message],
         unplaced: Sequence[str],
         tell: Tell,
     ) -> None:
@@ -48,12 +49,13 @@ class NetworkWatch:
             }
         )
         self._camera: Camera | None = None
-        self._mounts: dict[str, Transform] = {}
+        self._mounts: dict[str, dict[str, Transform]] = {one: {} for one in mounts}  # by topic
         for message in known:
-            if hasattr(message, "transforms"):
-                self._mounts |= _mounts(message)
+            decoded = self._decoder.decode(message.topic, message.data)
+            if message.topic in self._mounts:
+                self._mounts[message.topic] |= _mounts(decoded)
             else:
-                self._camera = _camera(message)
+                self._camera = _camera(decoded)
 
     def subscribe(self, transport: Transport) -> None:
         """Listen to the calibration and to fixed transforms."""
@@ -82,15 +84,14 @@ class NetworkWatch:
 
     def _take_mounts(self, arrival: Arrival) -> None:
         message = self._decoder.decode(arrival.topic, arrival.cdr)
-        found = _mounts(message)
-        late = [frame for frame in found if frame not in self._mounts]
+        found, known = _mounts(message), self._mounts[arrival.topic]
+        late = [frame for frame in found if frame not in known]
         moved = [
             frame
             for frame, T_parent_frame in found.items()
-            if frame not in late
-            and not np.allclose(self._mounts[frame], T_parent_frame, atol=_SAME)
+            if frame not in late and not np.allclose(known[frame], T_parent_frame, atol=_SAME)
         ]
-        self._mounts |= found
+        known |= found
         if late and self._unplaced:
             self._tell("tf_late", frames=late, missed=self._unplaced)
         if moved:

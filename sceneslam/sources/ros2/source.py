@@ -230,7 +230,7 @@ class Ros2(Measuring):
             types,
             camera_info=self.topics.camera_info,
             mounts=mounts,
-            known=[self.heard.decode(one) for one in self.heard.messages(followed)],
+            known=self.heard.messages(followed),
             unplaced=self._unplaced(),
             tell=self._tell,
         )
