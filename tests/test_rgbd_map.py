@@ -253,16 +253,16 @@ def test_points_of_a_camera_with_distortion_lie_on_the_walls():
     assert np.abs(beyond_m).max() < 0.003
 
 
-FOLDED = replace(CAMERA, fx=340.0, fy=340.0, distortion=(-0.33, 0.12, 0.0, 0.0, -0.02))
+FOLDED = replace(CAMERA, fx=310.0, fy=310.0, distortion=(-0.33, 0.12, 0.0, 0.0, -0.02))
 
 
 def test_pixels_that_no_ray_of_a_folding_lens_reaches_are_missing():
-    """This lens shows nothing farther than 330 px from the centre of its image."""
+    """This lens shows nothing farther than 301 px from the centre of its image."""
     layers = LayerBuilder(FOLDED, cloud_stride_px=8, cloud_voxel_m=0.03, grid_resolution_m=0.05)
     wall_m, image_bgr = np.full((480, 640), 2.0, np.float32), np.zeros((480, 640, 3), np.uint8)
     points = layers.view(wall_m, image_bgr, stamp_ns=0).points_base
-    assert 0.8 * 4800 < len(points) < 4800
-    assert np.abs(points[:, 1:]).max() < 3.0
+    assert 0.75 * 4800 < len(points) < 4800
+    assert np.linalg.norm(points[:, 1:], axis=1).max() < 2.0 * 1.64  # it folds at 1.62
     extractor = FeatureExtractor(
         FOLDED, Alignment(), count=500, fast_threshold_min=7, fast_noise_ratio=4.0
     )
@@ -270,7 +270,7 @@ def test_pixels_that_no_ray_of_a_folding_lens_reaches_are_missing():
     assert 300 < len(features) < 500
     assert len(features.descriptors) == len(features.levels) == len(features.depth_m)
     least_px, most_px = undistorted_bounds(FOLDED)
-    assert (np.abs([least_px[0], most_px[0] - 640]) < 150).all() and (least_px < -40).all()
+    assert (np.abs([least_px[0], most_px[0] - 640]) < 200).all() and (least_px < -40).all()
     assert (features.uv_px > least_px - 50).all() and (features.uv_px < most_px + 50).all()
 
 

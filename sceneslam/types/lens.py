@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 from sceneslam.types.rig import Camera
 
 _SAME_PX = 1.0  # a ray's own pixel is nearer than this
+# Iterations, and the error [px] after which they end: OpenCV's 5 lose the corners of wide lenses.
+_ENOUGH = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-3)
 
 
 def undistorted_rays(camera: Camera, uv_px: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -20,7 +22,8 @@ def undistorted_rays(camera: Camera, uv_px: NDArray[np.float64]) -> NDArray[np.f
     if not len(uv_px):
         return np.zeros((0, 2))
     distortion = np.array(camera.distortion)
-    rays = np.asarray(cv2.undistortPoints(uv_px[:, None], camera.K, distortion)[:, 0], np.float64)
+    found = cv2.undistortPoints(uv_px[:, None], camera.K, distortion, criteria=_ENOUGH)
+    rays = np.asarray(found[:, 0], np.float64)
     if distortion.any():
         points_cam, still = np.column_stack([rays, np.ones(len(rays))]), np.zeros(3)
         again_px = cv2.projectPoints(points_cam, still, still, camera.K, distortion)[0][:, 0]
