@@ -194,8 +194,9 @@ class SlamModule(Protocol):
     def get_trajectory(self) -> Trajectory:
         """Return the best current estimate of T_local_base at every stamp with a pose.
 
-        It is empty if a module never revises the poses of `track`. Called once, before `get_map`,
-        when the module is about to be shut down, with a last optimisation. May be slow.
+        It is empty if a module never revises the poses of `track`. Its covariances, where it has
+        any, replace those of `track`. Called once, before `get_map`, when the module is about to be
+        shut down, with a last optimisation. May be slow.
         """
         ...
 
@@ -432,8 +433,8 @@ class LiveMapper(Protocol):
         """Start with an empty map."""
         ...
 
-    def add(self, observation: Observation, T_map_base: Transform) -> None:
-        """Add an observation at T_map_base (4, 4) [m]."""
+    def add(self, observation: Observation, T_map_base: Transform, T_map_then: Transform) -> None:
+        """Add an observation at T_map_base (4, 4) [m]; at its scan's stamp, base was T_map_then."""
         ...
 
     def map(self) -> HybridMap:

@@ -150,6 +150,22 @@ def test_sweep_that_comes_after_newer_observations_is_matched_where_it_was_made(
     assert off_m.max() < 0.012
 
 
+def test_scan_whose_sweep_ends_after_the_observation_is_matched_where_it_was_made():
+    """A message has the stamp of its first beam; the middle of the sweep is 33 ms later."""
+    path = loop_path(480)
+    fine = np.vstack([np.tile(path[:1], (9, 1)), path])  # it stands until the map has begun
+    observations = drive(room(), fine, odometry=fine, rng=np.random.default_rng(5))
+    given = []
+    for index in range(0, 486, 3):
+        stamp_ns = index * 33_000_000
+        scan = replace(observations[index + 1].scan, stamp_ns=stamp_ns + 33_000_000)
+        given.append(replace(observations[index], stamp_ns=stamp_ns, scan=scan))
+    module = active()
+    off = errors(fine[0:486:3], [module.track(observation) for observation in given])
+    assert off[:, 0].max() < 0.012
+    assert off[:, 1].mean() < 0.002  # 0.013, if they were matched as of the stamps
+
+
 @pytest.mark.parametrize("late_s", [0.0, -0.08])
 def test_the_motion_within_a_lidars_sweep_is_undone(late_s):
     """It turns at 1 rad/s, and a sweep takes 0.1 s; or the clouds are older than the images."""

@@ -8,10 +8,17 @@ from fakes import RIG
 
 from sceneslam.sinks.live_map import NOTHING, LiveMap
 from sceneslam.types import se3
-from sceneslam.types.observation import Observation
+from sceneslam.types.observation import LaserScan, Observation
 from sceneslam.types.rig import Sensor
 
 IMAGE, DEPTH_M = np.zeros((2, 2, 3), np.uint8), np.ones((2, 2), np.float32)
+
+
+def scan(stamp_ns):
+    ranges_m = np.ones(4, np.float32)
+    limits = {"range_min_m": 0.1, "range_max_m": 10.0}
+    angles = {"angle_min_rad": 0.0, "angle_step_rad": 0.1}
+    return LaserScan(stamp_ns=stamp_ns, ranges_m=ranges_m, **angles, **limits)
 
 
 class Notes:
@@ -21,12 +28,14 @@ class Notes:
 
     def __init__(self):
         self.stamps_ns, self.is_adding, self.may_go_on = [], Event(), Event()
+        self.T_map_then = None
         self.may_go_on.set()
 
     def open(self, rig):
         pass
 
-    def add(self, observation, T_map_base):
+    def add(self, observation, T_map_base, T_map_then):
+        self.T_map_then = T_map_then
         self.stamps_ns.append(observation.stamp_ns)
         self.is_adding.set()
         assert self.may_go_on.wait(10.0)
@@ -60,6 +69,15 @@ def add(live_map, stamp_ns, **measured):
     """Add an observation at a new place."""
     seen = Observation(stamp_ns=stamp_ns, **measured)
     live_map.add(seen, se3.from_xy_yaw(float(stamp_ns), 0.0, 0.0))
+
+
+def test_a_late_scan_is_drawn_where_the_robot_was(live_map, mapper):
+    live_map.open(RIG)
+    add(live_map, 10)
+    add(live_map, 20)
+    add(live_map, 30, scan=scan(14))
+    assert mapper.is_adding.wait(10.0)
+    np.testing.assert_allclose(mapper.T_map_then, se3.from_xy_yaw(14.0, 0.0, 0.0), atol=1e-9)
 
 
 def test_observations_that_cannot_be_drawn_replace_none_that_can(live_map, mapper):

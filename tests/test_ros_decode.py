@@ -179,7 +179,7 @@ def test_a_thumbnail_does_not_end_a_cut_off_picture(options: list[int]) -> None:
 def scan(tmp_path: Path, ranges: list[float], **changes: float) -> Any:
     with Recorder(tmp_path / "one.mcap") as recorder:
         recorder.scan("/scan", STAMP_NS, ranges, **changes)
-    return decode.scan(decoded(tmp_path / "one.mcap"))
+    return decode.scan(decoded(tmp_path / "one.mcap"), STAMP_NS)
 
 
 def test_ranges_follow_our_conventions(tmp_path: Path) -> None:
@@ -194,6 +194,14 @@ def test_a_clockwise_laser_is_turned_round(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.ranges_m, np.array([3, 2, 1], np.float32))
     assert found.angle_step_rad == 0.25
     np.testing.assert_allclose(found.angles_rad, [0.0, 0.25, 0.5])
+
+
+@pytest.mark.parametrize(
+    ("beam_s", "later_ns"), [(0.01, 10_000_000), (-0.01, 10_000_000), (0.0, 0), (9.0, 0)]
+)
+def test_a_sweep_has_the_stamp_of_its_middle(tmp_path: Path, beam_s: float, later_ns: int) -> None:
+    found = scan(tmp_path, [1.0, 2.0, 3.0], time_increment=beam_s)
+    assert found.stamp_ns - STAMP_NS == pytest.approx(later_ns, abs=10)
 
 
 def test_a_scan_without_angles_is_damaged(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import Observation
 from sceneslam.types.planar import Planar
 from sceneslam.types.rig import Laser, Rig, Sensor
+from sceneslam.types.trail import Trail
 from sceneslam.types.trajectory import Trajectory
 
 RIG = Rig(sensors=frozenset({Sensor.SCAN, Sensor.ODOMETRY}), laser=Laser())
@@ -125,7 +126,7 @@ def map_of(true: NDArray[np.float64]) -> Planar:
 def key_scan(world: World, T_world_base: Planar, stamp_ns: int = 0) -> KeyScan:
     """Return the scan at a pose."""
     scan = world.scan(T_world_base, stamp_ns)
-    found = KeyScanner(RIG).make(Observation(stamp_ns=stamp_ns, scan=scan))
+    found = KeyScanner(RIG).make(Observation(stamp_ns=stamp_ns, scan=scan), Trail())
     assert found is not None
     return found
 

@@ -40,11 +40,11 @@ class GridAndPoints:
         if rig.camera is not None:  # with the paper's range of heights
             self._scanner = DepthScanner(rig.camera, beams=180, stride_px=2)
 
-    def add(self, observation: Observation, T_map_base: Transform) -> None:
-        """Add an observation at T_map_base (4, 4) [m]."""
+    def add(self, observation: Observation, T_map_base: Transform, T_map_then: Transform) -> None:
+        """Add an observation at T_map_base (4, 4) [m]; at its scan's stamp, base was T_map_then."""
         camera, laser = self._rig.camera, self._rig.laser
         if observation.scan is not None and laser is not None:
-            self._grid.insert(T_map_base @ laser.T_base_laser, observation.scan)
+            self._grid.insert(T_map_then @ laser.T_base_laser, observation.scan)
         elif observation.depth_m is not None and camera is not None and self._scanner is not None:
             scan = self._scanner.scan(observation.depth_m, stamp_ns=observation.stamp_ns)
             self._grid.insert(T_map_base @ scan_frame(camera), scan)

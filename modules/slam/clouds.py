@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.scans.deskew import check_times, moved, valid_times_s
 from sceneslam.types import se3
-from sceneslam.types.errors import InputError
 from sceneslam.types.lens import undistorted_rays
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Camera, Rig, Sensor
@@ -73,31 +73,6 @@ class CloudReader:
                 return np.asarray((reach > 0) & (reach >= near_m) & (reach <= far_m))
             square = np.einsum("ij,ij->i", points_sensor, points_sensor)
             return np.asarray((square > 0) & (square >= near_m**2) & (square <= far_m**2))
-
-
-def valid_times_s(times_s: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the points' times (N,) [s], 0 for those that are not finite."""
-    return np.nan_to_num(times_s, nan=0.0, posinf=0.0, neginf=0.0)
-
-
-def check_times(times_s: NDArray[np.float64], points: NDArray[np.floating]) -> None:
-    """Raise InputError unless every point (N, 3) has a time (N,)."""
-    if len(times_s) != len(points):
-        raise InputError(f"point_times_s: expected {len(points)} values, got {len(times_s)}")
-
-
-def moved(points: Cloud, times_s: NDArray[np.float64], twist_s: NDArray[np.float64]) -> Cloud:
-    """Return the points (N, 3) [m] moved by the twist times each point's time."""
-    rate = twist_s[3:]
-    speed = float(np.linalg.norm(rate))
-    shift = times_s[:, None] * twist_s[:3]
-    if speed < 1e-9:
-        return points + shift
-    axis = rate / speed
-    angle = (speed * times_s)[:, None]
-    across = np.cross(axis, points)
-    turned = points + np.sin(angle) * across + (1.0 - np.cos(angle)) * np.cross(axis, across)
-    return np.asarray(turned + shift)
 
 
 def _rays_cam(camera: Camera, stride_px: int) -> Cloud:

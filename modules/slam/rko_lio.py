@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.scans.deskew import valid_times_s
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import Observation
@@ -21,7 +22,7 @@ from sceneslam.types.rig import Sensor
 
 from .cloud_map import CloudMap
 from .cloud_odometry import CloudOdometry
-from .clouds import Cloud, CloudReader, valid_times_s
+from .clouds import Cloud, CloudReader
 from .quiet import quiet
 
 

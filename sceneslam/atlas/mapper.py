@@ -38,6 +38,7 @@ from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.run import Note
 from sceneslam.types.se3 import Transform, Vector
+from sceneslam.types.trail import Trail
 from sceneslam.views.view import Landmarks
 from sceneslam.views.view_finder import ViewFinder
 
@@ -66,6 +67,7 @@ class Mapper:
         """
         self._loaded = loaded if loaded is not None else empty_map()
         self._scanner, self._known, self._note = KeyScanner(rig), known, note
+        self._trail = Trail()
         views = self._loaded.views()
         self._views = ViewTaker(rig, is_keeping=keeps_views, is_comparing=bool(views))
         self._collector = Collector(rig, known, self._loaded.runs, self._views.locate)
@@ -148,6 +150,8 @@ class Mapper:
         is_begun = self._collector.has_begun(known)
         if is_begun:
             search.restart(known.begun_ns)
+            self._trail = Trail()
+        self._trail.add(stamp_ns, known.T_map_base)
         search.collect(stamp_ns)
         look = Look(stamp_ns=stamp_ns, T_run_base=known.T_map_base)
         is_step = is_begun or self._collector.has_moved(known)
@@ -370,7 +374,7 @@ class Mapper:
     def _scan(self, observation: Observation) -> KeyScan | None:
         """Return the scan of an observation; None without one, or with an invalid measurement."""
         try:
-            return self._scanner.make(observation)
+            return self._scanner.make(observation, self._trail)
         except InputError as error:  # as of a depth image that has another size than before
             if not self._has_refused:
                 self._warn(

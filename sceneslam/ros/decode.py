@@ -40,6 +40,7 @@ _COLOR: dict[str, tuple[str, int, int | None]] = {
 }
 _DEPTH = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 _COMPRESSED_DEPTH_HEADER = 12  # bytes: a format number and two float32 parameters
+_SWEEP_MAX_S = 0.5  # no planar laser turns slower
 
 
 def stamp_ns(message: Any) -> int:
@@ -159,11 +160,11 @@ def inertial(imu: Any) -> dict[Sensor, NDArray[np.float64]]:
     }
 
 
-def scan(message: Any) -> LaserScan | None:
+def scan(message: Any, stamp_ns: int) -> LaserScan | None:
     """Return the scan of a LaserScan message, None if its angles or range limits are invalid.
 
-    Ranges above the maximum (REP-117: also +inf) become inf; NaN, zero and below the minimum become
-    NaN. The beams of a clockwise laser are reversed.
+    `stamp_ns` is of its first beam. Ranges above the maximum (REP-117: also +inf) become inf; NaN,
+    zero and below the minimum become NaN. The beams of a clockwise laser are reversed.
     """
     low_m, high_m = float(message.range_min), float(message.range_max)
     step_rad, start_rad = float(message.angle_increment), float(message.angle_min)
@@ -179,13 +180,19 @@ def scan(message: Any) -> LaserScan | None:
         ranges_m[(ranges_m < np.float32(low_m)) | (ranges_m <= 0)] = np.nan
         ranges_m[ranges_m >= np.float32(high_m)] = np.inf
     return LaserScan(
-        stamp_ns=stamp_ns(message),
+        stamp_ns=stamp_ns + round(0.5e9 * _sweep_s(message)),
         ranges_m=pixels.locked(ranges_m),
         angle_min_rad=start_rad,
         angle_step_rad=step_rad,
         range_min_m=low_m,
         range_max_m=high_m,
     )
+
+
+def _sweep_s(message: Any) -> float:
+    """Return the time from the first beam of a LaserScan to the last, 0 if it is not known."""
+    sweep_s = abs(float(message.time_increment)) * (len(message.ranges) - 1)
+    return sweep_s if sweep_s < _SWEEP_MAX_S else 0.0  # 0 for NaN, too
 
 
 def camera(message: Any, *, is_rectified: bool = False) -> Camera | None:

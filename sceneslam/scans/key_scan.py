@@ -8,12 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.scans.depth_scan import DepthScanner
+from sceneslam.scans.deskew import deskewed
 from sceneslam.scans.lidar_scan import LidarScanner
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import LaserScan, Observation
 from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.se3 import Transform
+from sceneslam.types.trail import Trail
 
 _LEVEL_COS = np.cos(np.radians(5.0))  # lasers with more tilt measure floor and ceiling
 _BEAMS = 360  # of a lidar's revolution
@@ -43,6 +45,7 @@ class KeyScanner:
             self._laser = None
         self._lidar: LidarScanner | None = None
         if rig.lidar is not None:
+            self._T_base_lidar = rig.lidar.T_base_lidar
             self._lidar = LidarScanner(rig.lidar, beams=_BEAMS)
         self._depth: DepthScanner | None = None
         if rig.camera is not None:
@@ -57,12 +60,14 @@ class KeyScanner:
         made = {Sensor.SCAN: self._laser, Sensor.POINTS: self._lidar, Sensor.DEPTH: self._depth}
         return any(sensor in self._sensors for sensor, by in made.items() if by is not None)
 
-    def make(self, observation: Observation) -> KeyScan | None:
-        """Return the scan of an observation, None without a suitable sensor."""
+    def make(self, observation: Observation, trail: Trail) -> KeyScan | None:
+        """Return the scan of the newest observation of a trail, None without a suitable sensor."""
         if observation.scan is not None and self._laser is not None:
-            return _key_scan(observation.stamp_ns, observation.scan, self._laser.T_base_laser)
+            T_base_laser = trail.base_at(observation.scan.stamp_ns) @ self._laser.T_base_laser
+            return _key_scan(observation.stamp_ns, observation.scan, T_base_laser)
         if observation.points_lidar is not None and self._lidar is not None:
-            scan = self._lidar.scan(observation.points_lidar, stamp_ns=observation.stamp_ns)
+            points = deskewed(observation, self._T_base_lidar, trail.twist_s)
+            scan = self._lidar.scan(points, stamp_ns=observation.stamp_ns)
             return _key_scan(observation.stamp_ns, scan, self._lidar.T_base_laser)
         if observation.depth_m is not None and self._depth is not None:
             scan = self._depth.scan(observation.depth_m, stamp_ns=observation.stamp_ns)

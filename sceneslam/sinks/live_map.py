@@ -16,6 +16,7 @@ from sceneslam.types.maps import HybridMap, PointLayer
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig
 from sceneslam.types.se3 import Transform
+from sceneslam.types.trail import Trail
 
 _log = logging.getLogger(__name__)
 _STEP_M, _STEP_RAD = 0.1, 0.1  # smallest motion between two observations in the map
@@ -33,7 +34,8 @@ class LiveMap:
         self, mapper: LiveMapper, *, every_s: float, publish: Callable[[HybridMap], None]
     ) -> None:
         self._mapper, self._every_s, self._publish = mapper, every_s, publish
-        self._waiting: tuple[Observation, Transform] | None = None
+        self._waiting: tuple[Observation, Transform, Transform] | None = None
+        self._trail = Trail()
         self._T_map_drawn: Transform | None = None
         self._newest = NOTHING
         self._is_closed = False
@@ -45,17 +47,22 @@ class LiveMap:
         """Start with an empty map."""
         self._mapper.open(rig)
         self._is_closed, self._newest, self._T_map_drawn = False, NOTHING, None
+        self._trail = Trail()
         self._thread = threading.Thread(target=self._draw, name="map", daemon=True)
         self._thread.start()
 
     def add(self, observation: Observation, T_map_base: Transform) -> None:
         """Queue an observation that can be drawn, if its pose T_map_base (4, 4) [m] is new."""
+        self._trail.add(observation.stamp_ns, T_map_base)
         if not any(observation.has(sensor) for sensor in self._mapper.sensors):
             return
         if not self._is_new(T_map_base):
             return
+        scan, T_map_then = observation.scan, T_map_base
+        if scan is not None:
+            T_map_then = T_map_base @ self._trail.base_at(scan.stamp_ns)
         with self._changed:
-            self._waiting = (observation, T_map_base)
+            self._waiting = (observation, T_map_base, T_map_then)
             self._changed.notify()
 
     def newest(self) -> HybridMap:

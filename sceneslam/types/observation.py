@@ -20,7 +20,7 @@ UNSURE = "Unsure"  # the scene of a vote that could not be cast
 class LaserScan:
     """One sweep of a planar laser, counter-clockwise."""
 
-    stamp_ns: int  # of the first beam
+    stamp_ns: int  # of the middle of the sweep
     ranges_m: NDArray[np.float32]  # (N,); inf: no return within range; NaN: no measurement
     angle_min_rad: float
     angle_step_rad: float

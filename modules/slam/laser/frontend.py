@@ -23,6 +23,7 @@ from sceneslam.types.planar import (
     to_transform,
     turn,
 )
+from sceneslam.types.trail import Trail
 
 from .doubt import Doubt
 from .field import LikelihoodField
@@ -31,7 +32,6 @@ from .matcher import Match, Matcher, novelty
 from .prior import MotionPrior, difference, is_apart
 from .relocalizer import ScanRelocalizer
 from .surface import ScanSurfaceReader, SurfacePoints
-from .trail import Trail
 
 _OVERLAP_MIN_RATIO = 0.5  # with less, the map does not cover this place yet
 _FAILURES_MAX = 10  # consecutive failed matches before mapping continues from dead reckoning
@@ -78,11 +78,14 @@ class FrontEnd:
         noise = planar_covariance(motion.covariance)
         self._covariance = propagate(known, before, T_prev_curr, noise)
         surfaces = self._read(scan)
-        begin = before if scan is None else compose(before, self._trail.back_to(scan.stamp_ns))
-        self._trail.add(observation.stamp_ns, T_prev_curr)
+        begin = before
+        if scan is not None:
+            then_ns = scan.stamp_ns if before_ns is None else min(scan.stamp_ns, before_ns)
+            begin = compose(before, from_transform(self._trail.base_at(then_ns)))
+        self._trail.move(observation.stamp_ns, motion.T_prev_curr)
         if scan is None or surfaces is None:
             return self._predict(observation, predicted, motion)
-        # The scan may be older than the observation: match at the robot's pose then.
+        # The scan is older than the observation, or a sweep from it on: match at the pose then.
         ratio = _share(scan.stamp_ns, before_ns, observation.stamp_ns)
         predicted_then = compose(begin, ratio * T_prev_curr)
         T_then_now = between(predicted_then, predicted)
@@ -293,7 +296,10 @@ def _is_better(match: Match, other: Match) -> bool:
 
 
 def _share(stamp_ns: int, before_ns: int | None, now_ns: int) -> float:
-    """Return the position of a stamp between the last observation (0, or before) and this one."""
+    """Return the position of a stamp between the last observation (0, or before) and this one (1).
+
+    The middle of a sweep may be later.
+    """
     if before_ns is None or now_ns <= before_ns:
         return 1.0
-    return float(np.clip((stamp_ns - before_ns) / (now_ns - before_ns), 0.0, 1.0))
+    return float(np.clip((stamp_ns - before_ns) / (now_ns - before_ns), 0.0, 3.0))

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from sceneslam.motion.model import MotionModel
 from sceneslam.scans.depth_scan import DepthScanner
+from sceneslam.scans.deskew import deskewed
 from sceneslam.scans.lidar_scan import LidarScanner
 from sceneslam.scans.occupancy_grid import scan_layer
 from sceneslam.types import se3
@@ -18,7 +19,6 @@ from sceneslam.types.observation import LaserScan, Observation, Tracking
 from sceneslam.types.planar import to_transform
 from sceneslam.types.rig import Rig, Sensor
 
-from ..clouds import check_times, moved, valid_times_s
 from ..local import LocalModule
 from .frontend import FrontEnd
 from .keyframes import ScanKeyframes
@@ -66,7 +66,7 @@ class LaserSlam(LocalModule):
     _scanner: DepthScanner | LidarScanner | None = field(default=None, init=False)
     _front_end: FrontEnd | None = field(default=None, init=False)
     _T_base_laser: se3.Transform = field(default_factory=se3.identity, init=False)
-    _lidar_base: NDArray[np.float64] = field(default_factory=lambda: np.eye(6), init=False)
+    _T_base_lidar: se3.Transform = field(default_factory=se3.identity, init=False)
     _velocity: NDArray[np.float64] = field(default_factory=lambda: np.zeros(6), init=False)
 
     def __post_init__(self) -> None:
@@ -135,21 +135,18 @@ class LaserSlam(LocalModule):
 
     def _points_lidar(self, observation: Observation) -> NDArray[np.floating]:
         """Return the cloud (N, 3) [m], lidar, as from the observation's instant."""
-        points, times_s = observation.points_lidar, observation.point_times_s
-        assert points is not None and self._front_end is not None
-        if times_s is None or not self.deskew:
-            return points
-        check_times(times_s, points)
+        assert observation.points_lidar is not None and self._front_end is not None
+        if observation.point_times_s is None or not self.deskew:
+            return observation.points_lidar
         # Poses say what the velocity is, and depend on it here: of one step alone, it would swing.
         before, self._velocity = self._velocity, self._front_end.motion.inertia.velocity
-        twist_s = self._lidar_base @ (0.5 * (before + self._velocity))
-        return moved(points.astype(np.float64), valid_times_s(times_s), twist_s)
+        return deskewed(observation, self._T_base_lidar, 0.5 * (before + self._velocity))
 
     def _make_scanner(self, rig: Rig) -> DepthScanner | LidarScanner | None:
         if Sensor.SCAN in rig.sensors:
             return None
         if rig.lidar is not None and Sensor.POINTS in rig.sensors:
-            self._lidar_base = se3.adjoint(se3.inverse(rig.lidar.T_base_lidar))
+            self._T_base_lidar = rig.lidar.T_base_lidar
             return LidarScanner(
                 rig.lidar,
                 height_min_m=self.height_min_m,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -133,12 +133,12 @@ class BundleDecoder:
 
     def _scan(self, bundle: SynchronisedSamples, problems: list[str]) -> LaserScan | None:
         sample = self._sample(Sensor.SCAN, bundle)
-        scan = None if sample is None else decode.scan(sample.value)
+        scan = None if sample is None else decode.scan(sample.value, sample.stamp_ns)
         if sample is not None and scan is None:
             problems.append(
                 "a laser scan has no usable angles, or no range_max above its range_min"
             )
-        return None if sample is None or scan is None else replace(scan, stamp_ns=sample.stamp_ns)
+        return scan
 
     def _points(self, bundle: SynchronisedSamples, problems: list[str]) -> Cloud | None:
         sample = self._sample(Sensor.POINTS, bundle)

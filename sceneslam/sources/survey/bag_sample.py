@@ -158,7 +158,7 @@ class _Samples:
             self.depths_m += [] if depth_m is None else [depth_m]
             self.is_scaled |= not decode.is_metric_depth(value)
         elif sensor is Sensor.SCAN:
-            scan = decode.scan(value)
+            scan = decode.scan(value, stamp_ns)
             self.scans += [] if scan is None else [scan]
         elif sensor is Sensor.POINTS:
             found = cloud(value, stamp_ns)

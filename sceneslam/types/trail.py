@@ -1,0 +1,68 @@
+"""The robot's way of the last second: a scan is not of the instant of its observation."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sceneslam.types import se3
+from sceneslam.types.se3 import Transform
+
+_KEPT_NS = 1_000_000_000  # no driver is later
+_AHEAD = 2.0  # last motions: the middle of a sweep is not further ahead
+
+
+@dataclass(slots=True)
+class Trail:
+    """The poses of the last observations, in a frame of their own."""
+
+    _stamps_ns: list[int] = field(default_factory=list)
+    _poses: list[Transform] = field(default_factory=list)
+
+    def add(self, stamp_ns: int, T_w_base: Transform) -> None:
+        """Go on to a pose (4, 4) [m]; what is known of its stamp or later is replaced."""
+        self._cut(bisect_left(self._stamps_ns, stamp_ns - _KEPT_NS), self._after(stamp_ns))
+        self._stamps_ns.append(stamp_ns)
+        self._poses.append(T_w_base)
+
+    def move(self, stamp_ns: int, T_prev_base: Transform) -> None:
+        """Go on by the motion (4, 4) [m] to an observation."""
+        self.add(stamp_ns, self._poses[-1] @ T_prev_base if self._poses else se3.identity())
+
+    def base_at(self, stamp_ns: int) -> Transform:
+        """Return T_base_then (4, 4) [m]: the base at a stamp, in the newest.
+
+        Later than that it goes on as it moved last; the oldest one that is known is that before.
+        """
+        after = self._after(stamp_ns)
+        if after == len(self._poses):
+            ahead_s = 0.0 if not self._stamps_ns else (stamp_ns - self._stamps_ns[-1]) * 1e-9
+            return se3.exp(min(ahead_s, _AHEAD * self._step_s) * self.twist_s)
+        T_w_then = self._poses[after]
+        if after > 0:
+            first_ns, last_ns = self._stamps_ns[after - 1 : after + 1]
+            share = (stamp_ns - first_ns) / (last_ns - first_ns)
+            T_w_then = se3.interpolate(self._poses[after - 1], T_w_then, share)
+        return se3.inverse(self._poses[-1]) @ T_w_then
+
+    @property
+    def twist_s(self) -> NDArray[np.float64]:
+        """Return the velocity (6,) of the last motion, of se3.log order [m/s, rad/s], in base."""
+        if len(self._poses) < 2:
+            return np.zeros(6)
+        T_prev_base = se3.inverse(self._poses[-2]) @ self._poses[-1]
+        return np.asarray(se3.log(T_prev_base) / self._step_s)
+
+    @property
+    def _step_s(self) -> float:
+        last_ns = self._stamps_ns[-2:]
+        return (last_ns[-1] - last_ns[0]) * 1e-9 if last_ns else 0.0
+
+    def _after(self, stamp_ns: int) -> int:
+        return bisect_left(self._stamps_ns, stamp_ns)
+
+    def _cut(self, begin: int, end: int) -> None:
+        self._stamps_ns, self._poses = self._stamps_ns[begin:end], self._poses[begin:end]
