@@ -135,3 +135,48 @@ def test_clock_of_one_sensor_does_not_take_the_others_apart(ahead_s: int) -> Non
     found += synchroniser.flush()
     assert len(found) == 100
     assert all(one.depth and one.depth.value == one.primary.value for one in found)
+
+
+def live_sets(
+    late_ms: Callable[[int], int | None], count: int = 90
+) -> list[tuple[int, SynchronisedSamples]]:
+    """Return sets of images of 30 Hz with an IMU, and the delay [ms] at which each is given.
+
+    Depth of image i comes `late_ms(i)` after it, or not at all.
+    """
+    arrivals = [(at_ms, Sensor.GYRO, at_ms) for at_ms in range(0, count * 40, 5)]
+    for index in range(count):
+        arrivals.append((index * 33, Sensor.IMAGE, index * 33))
+        late = late_ms(index)
+        if late is not None:
+            arrivals.append((index * 33 + late, Sensor.DEPTH, index * 33))
+    streams = frozenset({Sensor.IMAGE, Sensor.DEPTH, Sensor.GYRO})
+    synchroniser = Synchroniser(Sensor.IMAGE, streams, 0.02, patience_s=0.05)
+    found: list[tuple[int, SynchronisedSamples]] = []
+    for at_ms, sensor, stamp_ms in sorted(arrivals, key=lambda one: one[0]):
+        sample = Sample(stamp_ns=stamp_ms * MS, arrived_ns=at_ms * MS, value=stamp_ms)
+        found += [(at_ms - one.primary.value, one) for one in synchroniser.add(sensor, sample)]
+    return found
+
+
+@pytest.mark.parametrize("late_ms", [(0, 4), (70, 70), (100, 100), (55, 80)])
+def test_live_depth_that_comes_late_is_waited_for_and_no_longer(late_ms: tuple[int, int]) -> None:
+    found = live_sets(lambda index: late_ms[index % 2])[5:]
+    assert len(found) > 75
+    assert all(one.depth and one.depth.value == one.primary.value for _, one in found)
+    assert max(delay for delay, _ in found) <= late_ms[1] + 5
+
+
+@pytest.mark.parametrize(
+    ("late_ms", "longest_ms"),
+    [
+        (lambda index: 4 if index < 30 else None, 60),  # it stops
+        (lambda index: 80 if index < 30 else None, 135),
+        (lambda index: 4 if index % 10 == 0 else None, 60),  # it is slow
+        (lambda index: 700, 60),  # hopeless
+    ],
+)
+def test_live_depth_that_is_missing_is_waited_for_as_long_as_it_would_take(
+    late_ms: Callable[[int], int | None], longest_ms: int
+) -> None:
+    assert max(delay for delay, _ in live_sets(late_ms)) <= longest_ms

@@ -14,6 +14,8 @@ from sceneslam.types.rig import Sensor
 from sceneslam.types.se3 import Transform
 
 _PATIENCE_S = 1.0  # longest wait of a message for a stream that is behind
+_LATE_NS = 250_000_000  # longest delay of depth that is waited for: later poses steer no robot
+_DELAYS = 30  # depth images whose delays count: of a second
 _REACH_NS = 1_000_000_000  # older samples are not used
 _ODOMETRY_GAP_NS = 1_000_000_000  # longest gap for interpolation of odometry
 _ODOMETRY_HOLD_NS = 100_000_000  # validity before the first and after the last odometry
@@ -47,7 +49,8 @@ class Synchroniser:
     """Takes samples in the order of recording; gives sets in the order of the primary's.
 
     A set waits for the streams in `waits_for` (None: all) until any sample has arrived `patience_s`
-    later. Stamps do not measure this wait: one sensor's clock can be ahead of the others'.
+    later, for depth until so long after it is due, as encoded depth comes later than its image.
+    Stamps do not measure this wait: one sensor's clock can be ahead of the others'.
     """
 
     def __init__(
@@ -71,6 +74,7 @@ class Synchroniser:
         }
         self._seen_ns: dict[Sensor, int] = {}  # the latest stamp of each stream
         self._arrived_ns = 0  # the latest arrival
+        self._delays_ns: deque[int] = deque(maxlen=_DELAYS)  # of depth, from stamp to arrival
         self._taken_ns: dict[Sensor, int] = {}  # the newest sample used in a set
         self._given_ns = -(2**63)  # the stamp of the last set
         self._passed: Sample | None = None  # the odometry before the oldest queued one
@@ -80,6 +84,8 @@ class Synchroniser:
         (self._waiting if sensor is self._primary else self._held[sensor]).append(sample)
         self._seen_ns[sensor] = max(self._seen_ns.get(sensor, 0), sample.stamp_ns)
         self._arrived_ns = max(self._arrived_ns, sample.arrived_ns)
+        if sensor is Sensor.DEPTH:
+            self._delays_ns.append(sample.arrived_ns - sample.stamp_ns)
         while self._waiting and self._is_complete(self._waiting[0]):
             yield self._bundle(self._waiting.popleft())
 
@@ -112,10 +118,8 @@ class Synchroniser:
     def _is_complete(self, primary: Sample) -> bool:
         """Tell whether no stream can still have a sample for the primary one's stamp."""
         stamp_ns = primary.stamp_ns
-        if self._arrived_ns - primary.arrived_ns > self._patience_ns:
-            return True
         for sensor, held in self._held.items():
-            if sensor not in self._waits_for:
+            if sensor not in self._waits_for or self._is_overdue(sensor, primary):
                 continue
             needed_ns = stamp_ns
             if sensor is Sensor.DEPTH and not any(one.stamp_ns == stamp_ns for one in held):
@@ -123,6 +127,14 @@ class Synchroniser:
             if self._seen_ns.get(sensor, -1) < needed_ns:
                 return False
         return True
+
+    def _is_overdue(self, sensor: Sensor, primary: Sample) -> bool:
+        """Tell whether a stream's sample for the primary one is not waited for any more."""
+        due_ns = primary.arrived_ns
+        if sensor is Sensor.DEPTH:
+            late_ns = [primary.stamp_ns + one - primary.arrived_ns for one in self._delays_ns]
+            due_ns += max((one for one in late_ns if 0 < one <= _LATE_NS), default=0)
+        return self._arrived_ns - due_ns > self._patience_ns
 
     def _bundle(self, primary: Sample) -> SynchronisedSamples:
         stamp_ns = self._given_ns = primary.stamp_ns
