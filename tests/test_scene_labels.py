@@ -116,6 +116,18 @@ def test_labels_are_of_the_same_group_as_the_recording_by_another_path(runs, tmp
     first, *_ = read_words(["labels.yaml"])
     assert first.config["source"]["path"] == "./film"
     assert first.group == read_word(f"Any={tmp_path}/film").group
+    assert str(tmp_path) not in (tmp_path / "labels.yaml").read_text()
+
+
+@pytest.mark.parametrize("runs", [True], indirect=True)
+def test_group_of_labels_is_where_the_recording_is_whatever_the_file_says(runs, tmp_path):
+    path = tmp_path / "labels.yaml"
+    assert main(["label", str(path), str(runs)]) == 0
+    node = yaml.safe_load(path.read_text())
+    node["recordings"][0]["group"] = "film"
+    path.write_text(yaml.safe_dump(node))
+    first, *_ = read_words([str(path)])
+    assert first.group == read_word(f"Any={tmp_path}/film").group
 
 
 @pytest.mark.parametrize("runs", [True], indirect=True)

@@ -53,7 +53,6 @@ class Labels:
             "recordings": [
                 {
                     "name": one.name,
-                    "group": one.group,
                     "config": dict(one.config),
                     "spans": [[s.start_s, s.end_s, s.scene, s.gain_m] for s in one.spans],
                 }
@@ -74,7 +73,7 @@ class Labels:
             recordings = [
                 Labelled(
                     name=str(one["name"]),
-                    group=str(one["group"]),
+                    group=_group(one["config"]),
                     config=dict(one["config"]),
                     spans=[
                         BestModuleSpan(
@@ -172,9 +171,6 @@ def _labelled(
     *,
     start_s: float,
 ) -> Labelled:
-    source = run.config["source"]
-    path = source.get("path")
-    recorded = str(path or source.get("story") or source["_target_"])
     gains_m = _gains_mps(best, drift_mps) * STEP_S
     per_second = round(1.0 / STEP_S)
     known = np.flatnonzero(~np.isnan(drift_mps).any(axis=1))
@@ -193,11 +189,22 @@ def _labelled(
             )
         )
     return Labelled(
-        name=f"{recorded}, {run.folder.parent.name}/{run.folder.name}",
-        group=group_of(recorded) if path else recorded,
+        name=f"{_recorded(run.config)}, {run.folder.parent.name}/{run.folder.name}",
+        group=_group(run.config),
         config={key: run.config.get(key) for key in ("source", "effects")},
         spans=spans,
     )
+
+
+def _recorded(config: Mapping[str, Any]) -> str:
+    """Return what a source reads: its path, or the story that it simulates."""
+    source = dict(config["source"])
+    return str(source.get("path") or source.get("story") or source["_target_"])
+
+
+def _group(config: Mapping[str, Any]) -> str:
+    recorded = _recorded(config)
+    return group_of(recorded) if config["source"].get("path") else recorded
 
 
 def _gains_mps(best: NDArray[np.int64], drift_mps: NDArray[np.float64]) -> NDArray[np.float64]:
