@@ -53,11 +53,26 @@ def test_truth_is_placed_by_the_first_pose_that_it_covers():
 def test_truth_is_that_of_the_run_to_which_it_is_aligned(tmp_path, monkeypatch):
     drawn = []
     monkeypatch.setattr(figures, "draw_paths", lambda path, paths, truth: drawn.append(truth))
-    made = partial(Run, folder=tmp_path, metrics={}, settings={})
+    made = partial(Run, folder=tmp_path, metrics={"association_gap_s": 0.01}, settings={})
     none = made(name="none", trajectory=Trajectory.empty(), truth=loop(10))
     some = made(name="some", trajectory=loop(20), truth=loop(20))
     assert figures.paths(tmp_path / "paths.png", [none, some])
     assert drawn == [some.truth]
+
+
+def test_a_map_that_begins_later_is_drawn_where_the_others_are(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(figures, "draw_paths", lambda path, paths, truth: drawn.append(paths))
+    whole = loop(100)
+    begun = moved(select(whole, np.arange(20, 100)), se3.inverse(whole.T_world_base[20]))
+    made = partial(Run, folder=tmp_path, metrics={"association_gap_s": 0.01}, settings={})
+    whole_run = made(name="whole", trajectory=whole, truth=None)
+    later_run = made(name="later", trajectory=begun, truth=None)
+    for runs, expected in (([whole_run, later_run], whole), ([later_run, whole_run], begun)):
+        figures.paths(tmp_path / "paths.png", runs)
+        whole_m, later_m = (drawn[-1][name].positions_m for name in ("whole", "later"))
+        assert later_m == pytest.approx(whole_m[20:], abs=1e-9)
+        assert later_m[-1] == pytest.approx(expected.positions_m[-1])
 
 
 def test_runs_are_apart_by_the_poses_within_their_own_association_gap(runs):

@@ -9,16 +9,21 @@ import numpy as np
 
 from sceneslam.compare.runs import Run
 from sceneslam.evaluation.accuracy import absolute_errors
+from sceneslam.evaluation.comparison import placed_in_map
 from sceneslam.evaluation.figures import style as look
 from sceneslam.evaluation.figures.paths import draw_paths
 
 
 def paths(path: Path, runs: Sequence[Run]) -> bool:
-    """Draw all paths from above as a PNG; False if no run has a pose."""
+    """Draw all paths from above, in the map of the first, as a PNG; False if no run has a pose."""
     first = next((run for run in runs if len(run.trajectory)), None)
     if first is None:
         return False
-    draw_paths(path, {run.name: run.trajectory for run in runs}, first.truth)
+    placed = {
+        run.name: placed_in_map(run.trajectory, first.trajectory, run.metrics["association_gap_s"])
+        for run in runs
+    }
+    draw_paths(path, placed, first.truth)
     return True
 
 

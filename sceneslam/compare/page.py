@@ -71,7 +71,7 @@ def write_page(folder: Path, runs: Sequence[Run]) -> Path:
 def _write(folder: Path, runs: Sequence[Run]) -> Path:
     pictures = []
     if figures.paths(folder / "paths.png", runs):
-        pictures.append(("paths.png", "All paths from above, in the frame map of each run."))
+        pictures.append(("paths.png", "All paths from above, in the frame map of the first run."))
     if figures.errors(folder / "errors.png", runs):
         aligned = "Position error over time, each trajectory aligned to the truth as a whole."
         pictures.append(("errors.png", aligned))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,22 +32,32 @@ class Difference:
 
 
 def compare(trajectory: Trajectory, reference: Trajectory, max_gap_s: float) -> Difference:
-    """Return the distance of poses within `max_gap_s` of each other, in `map`.
+    """Return the distance of poses within `max_gap_s` of each other, in the map of the first."""
+    placed = placed_in_map(reference, trajectory, max_gap_s)
+    matches = associate(trajectory, placed, max_gap_s)
+    apart_m = trajectory.positions_m[matches.first] - placed.positions_m[matches.second]
+    return Difference(
+        stamps_ns=trajectory.stamps_ns[matches.first],
+        differences_m=np.linalg.norm(apart_m, axis=1),
+    )
+
+
+def placed_in_map(trajectory: Trajectory, other: Trajectory, max_gap_s: float) -> Trajectory:
+    """Return a trajectory in the map of another one over the same path.
 
     Two runs that begin together begin at the same pose, and are not aligned. A map that begins
     later, at the identity, is laid on the other at the first pose that both have.
     """
-    matches = associate(trajectory, reference, max_gap_s)
-    T_first = trajectory.T_world_base[matches.first]
-    T_second = reference.T_world_base[matches.second]
-    if _begins_within(matches.first, T_first, matches.second) or _begins_within(
-        matches.second, T_second, matches.first
+    matches = associate(trajectory, other, max_gap_s)
+    T_own_base = trajectory.T_world_base[matches.first]
+    T_map_base = other.T_world_base[matches.second]
+    if not (
+        _begins_within(matches.first, T_own_base, matches.second)
+        or _begins_within(matches.second, T_map_base, matches.first)
     ):
-        T_second = T_first[0] @ se3.inverse(T_second[0]) @ T_second
-    return Difference(
-        stamps_ns=trajectory.stamps_ns[matches.first],
-        differences_m=np.linalg.norm(T_first[:, :3, 3] - T_second[:, :3, 3], axis=1),
-    )
+        return trajectory
+    T_map_own = T_map_base[0] @ se3.inverse(T_own_base[0])
+    return replace(trajectory, T_world_base=T_map_own @ trajectory.T_world_base)
 
 
 def _begins_within(

@@ -45,9 +45,9 @@ def evaluate(
 ) -> Metrics:
     """Return all metrics of a run; unknown ones (e.g. without ground truth) are None.
 
-    `reference` is another run's trajectory over the same path, compared without alignment. `notes`
-    are sentences on why an expected number is missing; `shortfalls` are sentences on why the run is
-    incomplete, which makes the exit code 1.
+    `reference` is another run's trajectory over the same path, not aligned unless one map begins
+    later. `notes` are sentences on why an expected number is missing; `shortfalls` are sentences on
+    why the run is incomplete, which makes the exit code 1.
     """
     switches = list_switches(result, truth, settings.scenes)
     detected = {str(e["scene"]) for e in result.events if e["event"] == "scene"}

@@ -41,7 +41,8 @@ _CAPTIONS = {
     "Shading: the active module; dash-dotted: a change of module.",
     "error_path": "The path from above, coloured by the distance from the true position.",
     "pose": "Position and heading in the frame map over time.",
-    "difference": "Distance from the reference run over the same path, without any alignment.",
+    "difference": "Distance from the reference run over the same path, without alignment; a map "
+    "that begins later is laid on the other at the first pose that both have.",
 }
 
 
