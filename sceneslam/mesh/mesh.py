@@ -20,10 +20,13 @@ from sceneslam.interfaces import Live, Source
 from sceneslam.types import se3
 from sceneslam.types.errors import InputError
 from sceneslam.types.files import own
+from sceneslam.types.lens import undistortion_maps
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Camera
 from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import Trajectory
+
+Maps = tuple[NDArray[np.float32], NDArray[np.float32]]  # columns and rows
 
 _STEP_M, _STEP_RAD = 0.1, 0.15  # smallest motion between two used images
 _BLOCKS = 20_000  # initial number of blocks of 16 x 16 x 16 voxels
@@ -83,6 +86,7 @@ def views(
     Images of a time without poses, as after tracking was lost, are left out.
     """
     last: Transform | None = None
+    maps = undistortion_maps(camera, camera) if any(camera.distortion) else None
     for one in observations:
         stamp_ns = np.array([one.stamp_ns])
         if one.depth_m is None or not len(covered(trajectory, stamp_ns, TRUTH_GAP_S)):
@@ -91,7 +95,7 @@ def views(
         if last is not None and not _is_apart(last, T_map_base):
             continue
         last = T_map_base
-        view = _view(one, T_map_base @ camera.T_base_cam, camera)
+        view = _view(one, T_map_base @ camera.T_base_cam, camera, maps)
         if np.count_nonzero(view.depth_m) > _PIXELS_MIN:
             yield view
 
@@ -136,19 +140,17 @@ class Volume:
         return int(mesh.triangle.indices.shape[0])
 
 
-def _view(one: Observation, T_map_cam: Transform, camera: Camera) -> ColouredDepthImage:
-    """Return the observation's undistorted images; depth out of range is missing."""
+def _view(
+    one: Observation, T_map_cam: Transform, camera: Camera, maps: Maps | None
+) -> ColouredDepthImage:
+    """Return the observation's images, undistorted by the maps; depth out of range is missing."""
     assert one.depth_m is not None
     depth_m = np.where(camera.measures(one.depth_m), one.depth_m, 0.0).astype(np.float32)
     grey = np.full((*depth_m.shape, 3), 128, np.uint8)
     image_bgr = grey if one.image_bgr is None else one.image_bgr
-    if any(camera.distortion):
-        distortion = np.array(camera.distortion)
-        columns, rows = cv2.initUndistortRectifyMap(
-            camera.K, distortion, np.eye(3), camera.K, camera.size_wh, cv2.CV_32FC1
-        )
-        depth_m = np.asarray(cv2.remap(depth_m, columns, rows, cv2.INTER_NEAREST), np.float32)
-        image_bgr = np.asarray(cv2.remap(image_bgr, columns, rows, cv2.INTER_LINEAR), np.uint8)
+    if maps is not None:
+        depth_m = np.asarray(cv2.remap(depth_m, *maps, cv2.INTER_NEAREST), np.float32)
+        image_bgr = np.asarray(cv2.remap(image_bgr, *maps, cv2.INTER_LINEAR), np.uint8)
     return ColouredDepthImage(depth_m=depth_m, image_bgr=image_bgr, T_map_cam=T_map_cam)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.types import se3
+from sceneslam.types.lens import undistortion_maps
 from sceneslam.types.rig import Camera
 
 Floats = NDArray[np.float32]
@@ -44,13 +45,10 @@ class Tracker:
         resized = np.diag([scale, scale, 1.0])
         resized[:2, 2] = 0.5 * scale - 0.5  # pixel centres are at whole numbers
         self.K = resized @ camera.K
-        distortion = np.array(camera.distortion)
-        self._maps_grey = cv2.initUndistortRectifyMap(
-            self.K, distortion, None, self.K, self._size_wh, cv2.CV_32FC1
-        )
-        self._maps_depth = cv2.initUndistortRectifyMap(
-            camera.K, distortion, None, self.K, self._size_wh, cv2.CV_32FC1
-        )
+        (fx, _, cx), (_, fy, cy) = self.K[:2].tolist()
+        small = replace(camera, size_wh=self._size_wh, fx=fx, fy=fy, cx=cx, cy=cy)
+        self._maps_grey = undistortion_maps(small, small)
+        self._maps_depth = undistortion_maps(camera, small)
         settings = cv2.OdometrySettings()
         settings.setCameraMatrix(self.K.astype(np.float32))
         near_m, far_m = camera.depth_range_m

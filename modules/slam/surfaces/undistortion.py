@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.types.lens import undistortion_maps
 from sceneslam.types.rig import Camera
 
 
@@ -13,12 +14,7 @@ class DepthUndistortion:
     """Moves the depths of one camera's images to where a pinhole camera would show them."""
 
     def __init__(self, camera: Camera) -> None:
-        self._maps = None
-        if any(camera.distortion):
-            distortion = np.array(camera.distortion)
-            self._maps = cv2.initUndistortRectifyMap(
-                camera.K, distortion, None, camera.K, camera.size_wh, cv2.CV_16SC2
-            )
+        self._maps = undistortion_maps(camera, camera) if any(camera.distortion) else None
 
     def apply(self, depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return a depth image (H, W) [m] without distortion; outside of the image it is 0."""
