@@ -130,6 +130,7 @@ def keyframe_at(T_local_cam, points_local, descriptors, landmark_ids):
         view=DepthView(
             points_base=np.zeros((0, 3), np.float32),
             colors_bgr=np.zeros((0, 3), np.uint8),
+            pixels=0,
             scan=None,
         ),
         turning=AT_REST,

@@ -63,6 +63,7 @@ def keyframe_at(x_m, landmark_ids=(), count=60, camera=CAMERA):
         view=DepthView(
             points_base=np.zeros((0, 3), np.float32),
             colors_bgr=np.zeros((0, 3), np.uint8),
+            pixels=0,
             scan=None,
         ),
         turning=AT_REST,
@@ -301,6 +302,19 @@ def test_surfaces_are_compared_with_any_stride_of_the_cloud(stride_px):
     assert not recognizer._shows(keyframe, beside, 1.5 * wall_m)
     sliver_m = np.where(np.arange(640) < 8, wall_m, np.float32(0.0))
     assert not recognizer._shows(keyframe, se3.identity(), sliver_m)
+
+
+def test_a_few_points_in_sparse_depth_show_no_place():
+    """Of 4800 pixels that the cloud takes, 30 have depth."""
+    layers = LayerBuilder(CAMERA, cloud_stride_px=8, cloud_voxel_m=0.03, grid_resolution_m=0.05)
+    sparse_m = np.zeros((480, 640), np.float32)
+    sparse_m[4:44:8, 4:52:8] = 2.0
+    keyframe = keyframe_at(0)
+    keyframe.view = layers.view(sparse_m, np.zeros((480, 640, 3), np.uint8), stamp_ns=0)
+    assert len(keyframe.view.points_base) == 30
+    recognizer = recognition.PlaceRecognizer(empty_map(CAMERA), None, min_inliers=20)
+    wall_m = np.full((480, 640), 2.0, np.float32)
+    assert not recognizer._shows(keyframe, se3.identity(), wall_m)
 
 
 @pytest.mark.parametrize(("height_m", "has_scans"), [(0.0, True), (0.5, False)])

@@ -25,7 +25,10 @@ def keyframe_at(y_m, points_local, descriptors, *, landmark_ids, depth_m):
         features=features_at(uv_px, descriptors, depth_m=np.where(depth_m, z, 0.0)),
         landmark_ids=landmark_ids.copy(),
         view=DepthView(
-            points_base=nothing.astype(np.float32), colors_bgr=nothing.astype(np.uint8), scan=None
+            points_base=nothing.astype(np.float32),
+            colors_bgr=nothing.astype(np.uint8),
+            pixels=0,
+            scan=None,
         ),
         turning=AT_REST,
         is_monocular=True,

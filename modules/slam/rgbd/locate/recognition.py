@@ -19,7 +19,7 @@ from .localizer import VisualFix, VisualLocalizer
 
 _MIN_FOUND_RATIO = 0.2  # of the expected landmarks, found at least
 _MIN_SURFACE_RATIO = 0.7  # of the surfaces in both depth images, agreeing at least
-_MIN_COMMON_RATIO = 0.02  # of a keyframe's points, in both depth images at least
+_MIN_COMMON_RATIO = 0.02  # of the pixels of a keyframe's cloud, in both depth images at least
 _MIN_COMMON_POINTS = 5  # where its cloud is coarse
 _SURFACE_SLACK_M = 0.05  # tolerance for the pose error
 _SURFACE_SIGMAS = 4.0  # of one depth, so 2.8 of a difference
@@ -73,7 +73,7 @@ class PlaceRecognizer:
         True for a keyframe without depth, as nothing can be compared.
         """
         camera = self._map.depth_camera
-        points_base = keyframe.view.points_base
+        points_base, pixels = keyframe.view.points_base, keyframe.view.pixels
         if not len(points_base):
             return True
         T_cam_keyframe = se3.inverse(T_local_base @ camera.T_base_cam) @ keyframe.T_local_base
@@ -87,7 +87,7 @@ class PlaceRecognizer:
         inside &= (row >= 0) & (row < camera.size_wh[1])
         seen_m, z = depth_m[row[inside], column[inside]], z[inside]
         measured = camera.measures(seen_m)
-        if measured.sum() < max(_MIN_COMMON_RATIO * len(points_base), _MIN_COMMON_POINTS):
+        if measured.sum() < max(_MIN_COMMON_RATIO * pixels, _MIN_COMMON_POINTS):
             return False
         seen_m, z = seen_m[measured], z[measured]
         sigma_m = self._map.inverse_depth_sigma_per_m * seen_m**2

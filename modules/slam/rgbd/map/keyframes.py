@@ -26,6 +26,7 @@ class DepthView:
 
     points_base: NDArray[np.float32]  # (M, 3) [m]
     colors_bgr: NDArray[np.uint8]  # (M, 3)
+    pixels: int  # that were read, with valid depth or without
     scan: LaserScan | None  # None if the camera does not see the scan's band of heights
 
 
@@ -33,7 +34,7 @@ def nothing_seen() -> DepthView:
     """Return the empty view, for an observation without a depth image."""
     nothing = np.zeros((0, 3))
     points_base, colors_bgr = nothing.astype(np.float32), nothing.astype(np.uint8)
-    return DepthView(points_base=points_base, colors_bgr=colors_bgr, scan=None)
+    return DepthView(points_base=points_base, colors_bgr=colors_bgr, pixels=0, scan=None)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -61,7 +61,9 @@ class LayerBuilder:
         points_base = se3.apply(camera.T_base_cam, points_cam).astype(np.float32)
         scan = None if self._scanner is None else self._scanner.scan(depth_m, stamp_ns=stamp_ns)
         colors_bgr = image_bgr[self._sampled][row, column]
-        return DepthView(points_base=points_base, colors_bgr=colors_bgr, scan=scan)
+        return DepthView(
+            points_base=points_base, colors_bgr=colors_bgr, pixels=depth.size, scan=scan
+        )
 
     def build(self, keyframes: Sequence[Keyframe]) -> MapLayers:
         """Return the layers in `local`; scans only for planar motion."""
