@@ -31,7 +31,10 @@ TYPES = {
     INFO: "sensor_msgs/msg/CameraInfo",
     "/scan": "sensor_msgs/msg/LaserScan",
     "/odom": "nav_msgs/msg/Odometry",
+    "/wheels": "nav_msgs/msg/Odometry",
+    "/fused": "nav_msgs/msg/Odometry",
     "/imu": "sensor_msgs/msg/Imu",
+    names.TF: "tf2_msgs/msg/TFMessage",
     names.TF_STATIC: "tf2_msgs/msg/TFMessage",
     "/husky/scan": "sensor_msgs/msg/LaserScan",
     "/husky/tf_static": "tf2_msgs/msg/TFMessage",
@@ -51,6 +54,7 @@ class Robot:
         self.qos = {}
         self.mounts = {names.LASER: T_BASE_LASER, names.CAMERA: se3.identity()}
         self.root_mounts, self.root_is_latched = None, True
+        self.tf_frame, self.tf_ahead_m = names.ODOM, 0.0
         self._topics = {topic: TYPES[topic] for topic in topics}
         for topic in topics:  # what serialises a type is made at its first message
             self._message(self.encoder, topic, 0)
@@ -92,10 +96,13 @@ class Robot:
         return self.root_is_latched if is_root else topic.endswith(names.TF_STATIC)
 
     def _message(self, encoder, topic, stamp_ns):
-        if topic == "/odom":
-            x_m = stamp_ns / S
+        x_m = stamp_ns / S
+        if topic in ("/odom", "/wheels", "/fused"):
             T_odom_base = se3.from_parts(np.eye(3), np.array([x_m, 0.0, 0.0]))
             return encoder.odometry(stamp_ns, T_odom_base, names.ODOM)
+        if topic == names.TF:
+            T_odom_base = se3.from_xy_yaw(x_m + self.tf_ahead_m, 0.0, 0.0)
+            return encoder.transforms(stamp_ns, self.tf_frame, {names.BASE: T_odom_base})
         if topic == "/imu":
             return encoder.imu(stamp_ns, {Sensor.GYRO: np.array([0.0, 0.0, 0.5])})
         if topic.endswith("/scan"):
@@ -346,6 +353,30 @@ def test_two_robots_that_name_a_frame_alike_move_nothing(make):
     robot.measure(1, without=("/uav1/scan",))
     source.close()
     assert not list(source.notices())
+
+
+@pytest.mark.parametrize(
+    ("topics", "how", "says"),
+    [
+        (("/odom",), {}, None),
+        (("/odom",), {"tf_ahead_m": 0.5}, "in 'odom' and /odom has other poses: choose"),
+        (("/odom",), {"tf_frame": "fused"}, "in 'fused' and /odom is in frame 'odom': choose"),
+        ((), {}, "in 'odom' and no odometry is used: map -> base_link would be a second parent"),
+    ],
+)
+def test_odometry_that_is_not_that_of_the_transforms_is_named(make, topics, how, says):
+    robot = Robot("/scan", names.TF, *topics)
+    vars(robot).update(how)
+    source = make(robot)
+    heard(source, robot)
+    odd = list(source.survey().odd)
+    assert [f"/tf has 'base_link' {says}" in one for one in odd] == ([True] if says else [])
+
+
+def test_of_several_topics_of_odometry_the_one_of_the_transforms_is_to_be_chosen(make):
+    robot = Robot("/scan", "/wheels", "/fused", names.TF)
+    with pytest.raises(InputError, match="the one that is odom -> base_link on /tf"):
+        heard(make(robot), robot)
 
 
 def test_every_topic_of_transforms_has_to_be_latched(make):

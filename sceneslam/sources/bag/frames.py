@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from itertools import islice
 
 from sceneslam.ros import decode, names
@@ -58,14 +58,18 @@ class FrameTree:
         second_root, T_root_second = self._to_root(second)
         return se3.inverse(T_root_first) @ T_root_second if first_root == second_root else None
 
+    def above(self, frame: str) -> Sequence[str]:
+        """Return the frames that a frame is placed in, from its parent to its root."""
+        found = [frame]
+        while found[-1] in self._up and self._up[found[-1]][0] not in found:
+            found.append(self._up[found[-1]][0])
+        return found[1:]
+
     def _to_root(self, frame: str) -> tuple[str, Transform]:
-        T_root_frame, met = se3.identity(), {frame}
-        while frame in self._up:
-            frame, T_parent_child = self._up[frame]
-            if frame in met:
-                break
-            met.add(frame)
-            T_root_frame = T_parent_child @ T_root_frame
+        T_root_frame = se3.identity()
+        for parent in self.above(frame):
+            T_root_frame = self._up[frame][1] @ T_root_frame
+            frame = parent
         return frame, T_root_frame
 
 

@@ -19,6 +19,7 @@ _log = logging.getLogger(__name__)
 NONE = "none"  # as a topic's name: the sensor is not used
 _FIRST_IMU = 100  # messages searched for both sensors, which may come in messages of their own
 _LATER_IMU = 20  # messages at each of so many times, where a vector of all of these is zero
+_HINTS = {"odometry": "; of a robot, the one that is odom -> base_link on /tf"}
 _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _POSES = (
     "nav_msgs/msg/Odometry",
@@ -233,6 +234,7 @@ def _only(need: str, candidates: Sequence[str]) -> str:
     if len(candidates) > 1:
         raise InputError(
             f"topics.{need}: several topics fit ({', '.join(candidates)}): "
-            f"choose one, such as source.topics.{need}={candidates[0]} ({NONE}: do without)"
+            f"choose one, such as source.topics.{need}={candidates[0]} "
+            f"({NONE}: do without){_HINTS.get(need, '')}"
         )
     return candidates[0] if candidates else NONE

@@ -34,6 +34,7 @@ from sceneslam.sources.ros2.expected import (
     lacks_calibration,
     lacks_transforms,
     oddities,
+    odometry_oddities,
 )
 from sceneslam.sources.ros2.live_recording import LiveRecording
 from sceneslam.sources.ros2.network_watch import NetworkWatch
@@ -133,6 +134,7 @@ class Ros2(Measuring):
             odd=[
                 *oddities(self.heard, [name for name in self._named.values() if name]),
                 *unregistered(self.heard, self.topics, self.frames),
+                *odometry_oddities(self.heard, self.topics.odometry, self.frames),
             ],
         )
 
