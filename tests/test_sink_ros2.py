@@ -387,11 +387,11 @@ def test_points_have_the_colour_of_their_pixel_and_lie_where_it_looked():
     image = np.full((6, 8, 3), (1, 2, 3), np.uint8)
     depth_m = np.zeros((6, 8), np.float32)
     depth_m[3, 4] = 2.0  # the principal point: straight ahead
-    mapper.add(Observation(stamp_ns=0, image_bgr=image, depth_m=depth_m), at(1.0))
+    mapper.add(Observation(stamp_ns=0, image_bgr=image, depth_m=depth_m), at(1.0), at(1.0))
     layer = mapper.map().points
     np.testing.assert_allclose(layer.points, [[3.0, 0.0, 0.0]], atol=1e-6)
     assert layer.colors_bgr.tolist() == [[1, 2, 3]]
-    mapper.add(Observation(stamp_ns=1, image_bgr=image, depth_m=depth_m), at(1.0))
+    mapper.add(Observation(stamp_ns=1, image_bgr=image, depth_m=depth_m), at(1.0), at(1.0))
     assert len(mapper.map().points.points) == 1
 
 
