@@ -4,8 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from driving import GATE, TABLE, drive, events, policy
-from fakes import PERIOD_NS, RIG, ExactModule, ScriptedDetector, observation, true_pose
+from driving import GATE, TABLE, assert_exact, drive, events, policy
+from fakes import (
+    PERIOD_NS,
+    RIG,
+    DepthModule,
+    ExactModule,
+    ScriptedDetector,
+    observation,
+    true_pose,
+)
 from test_acquittal import OPTIONS, Uncertain, frozen
 
 from sceneslam.atlas.atlas import Atlas
@@ -14,6 +22,7 @@ from sceneslam.bus.scene.scene_filter import WindowFilter
 from sceneslam.storage.events import EventLog
 from sceneslam.types import se3
 from sceneslam.types.observation import SceneVote, TrackingStatus
+from sceneslam.types.trajectory import Trajectory
 
 ALONE = {"Bright": ["bright"], "Dark": ["bright"]}
 
@@ -103,6 +112,164 @@ def test_a_scene_that_is_over_changes_no_module():
         ("dark", "the scene is over")
     ]
     assert modules["bright"].activations == 1 and set(atlas.pose_modules) == {"bright"}
+
+
+def test_another_scene_with_the_same_module_does_not_stop_its_start(monkeypatch):
+    monkeypatch.setattr(ScriptedDetector, "scenes", ("Bright", "Dark", "Dim"))
+    modules = {"bright": ExactModule(), "dark": ExactModule()}
+    _, _, log, _ = drive(
+        modules,
+        steps=150,
+        table=TABLE | {"Dim": ["dark", "bright"]},
+        scene_at=lambda index: "Bright" if index < 40 else ("Dark", "Dim")[index // 15 % 2],
+        handover="rewind",
+        confirm_window_s=1.0,
+        startup_s={"dark": 3.0},
+    )
+    assert [to for _, to, _ in decisions(log)] == ["bright", "dark"]
+    assert not events(log, "refused") and modules["dark"].activations == 1
+
+
+@pytest.mark.parametrize("lost", [range(40, 55), range(40, 68)])
+def test_a_loss_that_is_over_changes_no_module(lost):
+    """The other module takes 4 s to start; the first one tracks again for 2.5 s, or 1.2 s, then."""
+    modules = {"bright": ExactModule(lost=lost), "dark": ExactModule()}
+    options = {"lost_patience_s": 1.0, "startup_s": {"dark": 3.0}}
+    _, _, log, _ = drive(modules, steps=200, handover="rewind", **options)
+    assert [to for _, to, _ in decisions(log)] == ["bright"]
+    assert [each["why"] for each in events(log, "refused")] == ["the module tracks again"]
+    assert modules["bright"].activations == 1
+
+
+def test_a_module_that_the_new_scene_does_not_want_is_not_waited_for():
+    """The first one is lost, its fallback takes 8 s to start, and it becomes dark."""
+    modules = {"b": ExactModule(lost=range(40, 999)), "f": ExactModule(), "d": ExactModule()}
+    _, _, log, _ = drive(
+        modules,
+        table={"Bright": ["b", "f"], "Dark": ["d"]},
+        scene_at=lambda index: "Dark" if index >= 45 else "Bright",
+        handover="rewind",
+        startup_s={"f": 8.0},
+        lost_patience_s=1.0,
+    )
+    (_, first, _), (at, second, why) = decisions(log)
+    assert (first, second, why) == ("b", "d", "scene") and 65 <= at <= 67
+    assert modules["f"].activations == 0
+
+
+def test_the_first_module_is_that_of_the_scene_that_has_become():
+    modules = {"b": ExactModule(), "d": ExactModule()}
+    _, atlas, log, _ = drive(
+        modules,
+        table={"Bright": ["b"], "Dark": ["d"]},
+        scene_at=lambda index: "Dark" if index >= 5 else "Bright",
+        handover="rewind",
+        startup_s={"b": 8.0},
+    )
+    assert [to for _, to, _ in decisions(log)] == ["d"]
+    assert modules["b"].activations == 0 and "d" in atlas.pose_modules
+
+
+@pytest.mark.parametrize(("handover", "window_s"), [("warm", 2.0), ("rewind", 0.5)])
+def test_a_module_without_data_is_waited_for_beside_one_that_tracks(handover, window_s):
+    modules = {"bright": ExactModule(), "dark": DepthModule()}
+    _, _, log, _ = drive(
+        modules,
+        scene_at=lambda index: "Dark" if index >= 40 else "Bright",
+        handover=handover,
+        confirm_window_s=window_s,
+        lost_patience_s=1.0,
+    )
+    assert [to for _, to, _ in decisions(log)] == ["bright"]
+    assert [each["why"] for each in events(log, "refused")] == ["silent"]
+    assert modules["bright"].activations == 1
+
+
+class Closing(ExactModule):
+    """It drifts by 0.5 m in 12 s, and closes a loop at 150; it may tell the path at the end."""
+
+    def __init__(self, *, tells):
+        super().__init__()
+        self.tells, self.said = tells, []
+
+    def track(self, observation):
+        told, index = super().track(observation), observation.stamp_ns // PERIOD_NS
+        self.said.append((observation.stamp_ns, told.T_local_base))
+        aside = se3.from_xy_yaw(0.0, min(index / 240, 0.5) if index < 150 else 0.0, 0.0)
+        T_local_base = aside @ told.T_local_base
+        return replace(told, T_local_base=T_local_base, revision=int(index >= 150))
+
+    def get_trajectory(self):
+        stamps_ns, poses = zip(*self.said, strict=True)
+        told = Trajectory(stamps_ns=np.array(stamps_ns), T_world_base=np.stack(poses))
+        return told if self.tells else Trajectory.empty()
+
+
+@pytest.mark.parametrize("tells", [True, False])
+@pytest.mark.parametrize(("startup_s", "catch_up_steps"), [(0.0, None), (0.0, 2), (4.0, None)])
+def test_a_loop_closed_after_the_scene_changed_is_kept_at_the_hand_over(
+    tells, startup_s, catch_up_steps
+):
+    """Dark is confirmed at 158, or at 148, so that the loop is closed during the catch-up."""
+    dark_at = 138 if catch_up_steps is None else 128
+    _, atlas, log, _ = drive(
+        {"bright": Closing(tells=tells), "dark": ExactModule()},
+        scene_at=lambda index: "Dark" if index >= dark_at else "Bright",
+        handover="rewind",
+        steps=230,
+        gate=GATE,
+        startup_s={"dark": startup_s},
+        catch_up_steps=catch_up_steps,
+    )
+    assert [to for _, to, _ in decisions(log)] == ["bright", "dark"]
+    for path in (atlas.online, atlas.trajectory):
+        off_m = path.T_world_base[-1, :3, 3] - true_pose(229 * PERIOD_NS)[:3, 3]
+        assert np.linalg.norm(off_m) < 1e-6
+
+
+def test_a_late_first_pose_without_odometry_continues_the_motion_that_was_known():
+    modules = {"bright": ExactModule(), "dark": ExactModule(lost=range(56))}
+    _, atlas, _, _ = drive(
+        modules,
+        scene_at=lambda index: "Dark" if index >= 40 else "Bright",
+        handover="rewind",
+        has_odometry=False,
+    )
+    off_m = atlas.trajectory.T_world_base[-1, :3, 3] - true_pose(99 * PERIOD_NS)[:3, 3]
+    assert np.linalg.norm(off_m) < 1e-6
+    assert np.sqrt(atlas.covariances(has_odometry=False)[-1][:3, :3].trace()) < 0.1
+
+
+def test_a_gap_is_counted_from_the_first_pose_not_from_the_first_answer():
+    modules = {"bright": ExactModule(lost=range(41, 999)), "dark": ExactModule(lost=range(56))}
+    _, atlas, log, _ = drive(
+        modules,
+        scene_at=lambda index: "Dark" if index >= 40 else "Bright",
+        handover="rewind",
+        lost_patience_s=5.0,
+    )
+    assert np.diff(atlas.trajectory.stamps_ns).max() == PERIOD_NS
+    assert events(log, "handover")[-1]["gap_s"] == pytest.approx(PERIOD_NS * 1e-9)
+
+
+def test_wheels_that_slip_slowly_are_not_cleared_by_one_step():
+    """They slip by 4 cm per step from 40 on; the second module tracks twice and is lost."""
+
+    def feed(index):
+        spun = se3.from_xy_yaw(0.04 * max(index - 40, 0), 0.0, 0.0)
+        return replace(observation(index), T_odom_base=spun @ true_pose(index * PERIOD_NS))
+
+    modules = {
+        "bright": Certain(lost=range(60, 1000)),
+        "dark": Certain(lost=[*range(61), *range(63, 80)]),
+    }
+    _, atlas, log, _ = drive(
+        modules, steps=110, gate=GATE, feed=feed, handover="rewind", lost_patience_s=1.0
+    )
+    assert events(log, "odometry")[-1]["is_believed"] is False
+    posed = (atlas.trajectory.stamps_ns // PERIOD_NS).tolist()
+    assert posed[-1] == 109 and not {68, 79} & {*posed}
+    assert_exact(atlas)
 
 
 def test_one_observation_without_odometry_leaves_the_patience_as_it_is():

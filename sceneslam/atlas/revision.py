@@ -32,7 +32,8 @@ def revise(
     """Return the poses after all revisions; `pose_sessions` (N,) is -1 before the first session.
 
     Every pose is corrected as the last revised pose of its session before it, so that bridged
-    motions do not change. A session starts where the revised session before it ended (Eq. 1).
+    motions do not change. A session starts where the revised session before it ended (Eq. 1), by
+    what was known of that one's map at the hand-over.
     """
     moved = np.array(T_map_base)
     placed: list[Transform] = []
@@ -41,7 +42,7 @@ def revise(
         rows = np.flatnonzero(pose_sessions == index)
         T_map_local, corrections = _corrections(session, carried, stamps_ns[rows])
         placed.append(T_map_local)
-        moved[rows] = corrections @ moved[rows]
+        moved[rows] = corrections[:-1] @ moved[rows]
         carried = corrections[-1] if len(rows) else carried
     return Revised(T_map_local=placed, T_map_base=moved)
 
@@ -49,10 +50,13 @@ def revise(
 def _corrections(
     session: OpenSession, carried: Transform, stamps_ns: NDArray[np.int64]
 ) -> tuple[Transform, NDArray[np.float64]]:
-    """Return the revised T_map_local (4, 4), and T_new_told (N, 4, 4) of the poses in `map`."""
+    """Return the revised T_map_local (4, 4), and T_new_told (N + 1, 4, 4) of poses in `map`.
+
+    The last one is of the module's last pose, which may be replaced since.
+    """
     online, revised, T_map_local = session.online, session.revised, carried @ session.T_map_local
     if not len(revised):
-        return T_map_local, np.broadcast_to(carried, (len(stamps_ns), 4, 4))
+        return T_map_local, np.broadcast_to(carried, (len(stamps_ns) + 1, 4, 4))
     _, told_rows, revised_rows = np.intersect1d(
         online.stamps_ns, revised.stamps_ns, assume_unique=True, return_indices=True
     )
@@ -64,6 +68,7 @@ def _corrections(
         before = T_revised_told[0]
         T_map_local = T_map_local @ se3.inverse(before)
     newest = np.searchsorted(online.stamps_ns[told_rows], stamps_ns, side="right")
+    newest = np.append(newest, len(told_rows))
     T_revised_told = np.concatenate([before[None], T_revised_told])[newest]
     return T_map_local, T_map_local @ T_revised_told @ se3.inverse(session.T_map_local)
 

@@ -93,6 +93,16 @@ class Bridge:
         self._move(observation, self.T_map_base @ T_prev_curr)
         return self.T_map_base
 
+    def moved(self, T_new_old: Transform) -> Bridge:
+        """Return the bridge in a map (4, 4) that was corrected."""
+        twin = self.copy()
+        for name in ("_before", "_known"):
+            known = getattr(self, name)
+            setattr(twin, name, known and (known[0], T_new_old @ known[1]))
+        if self._T_map_base is not None:
+            twin._T_map_base = T_new_old @ self._T_map_base
+        return twin
+
     def _is_recent(self, stamp_ns: int) -> bool:
         return self._known is not None and self.unknown_s(stamp_ns) <= KEPT_S
 

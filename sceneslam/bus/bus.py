@@ -214,9 +214,13 @@ class Bus:
 
     def _change_over(self, observation: Observation) -> Outcome | None:
         confirmed = self._watch.confirmed
-        if confirmed is not None and self._changeover.is_over(confirmed.scene):
-            self._changeover.give_up()
-            return Outcome.FAILURE
+        why = "" if confirmed is None else self._changeover.why_over(confirmed.scene)
+        if why:
+            self._changeover.give_up(why)
+            if self._estimator.active is not None:
+                return Outcome.FAILURE
+            now, reason = self._look(observation), "first" if self._changeover.is_first else "scene"
+            self._begin(now, Decision(action=Action.SWITCH, to=now.choices, reason=reason))
         return self._changeover.go_on()
 
     def _decide(self, observation: Observation) -> Outcome | None:

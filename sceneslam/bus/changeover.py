@@ -17,6 +17,7 @@ from sceneslam.types.errors import ModuleError
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig
 
+_LOSSES = (Health.LOST, Health.SILENT, Health.SUSPECT)  # reasons that may pass
 _TRIAL_NS = 1_000_000_000  # the first choice tracks this long on standby before it takes over again
 
 
@@ -123,6 +124,11 @@ class Changeover:
         return StandbyTrial.PASSED if self._tracked_ns >= _TRIAL_NS else StandbyTrial.RUNNING
 
     @property
+    def is_first(self) -> bool:
+        """Tell whether the change is to the first module of the run."""
+        return self._verdict.reason == "first"
+
+    @property
     def _tracked_ns(self) -> int:
         """Return how long the module on trial has tracked, 0 without one."""
         handover = None if self._trial is None else self._trial.handover
@@ -157,11 +163,10 @@ class Changeover:
             if is_accepted is None:
                 return None
             key, self._attempt = self._attempt.runner.key, None
-            is_start = self._verdict.reason == "first"
             if is_accepted:
-                is_best = is_start or key == self._verdict.to[0]
+                is_best = self.is_first or key == self._verdict.to[0]
                 return Outcome.SUCCESS if is_best else Outcome.FAILURE
-            if is_start:
+            if self.is_first:
                 return Outcome.FAILURE  # the machine enters `start` again, with the next candidate
         active = self._estimator.active
         if active is not None and active.is_failed:
@@ -170,16 +175,30 @@ class Changeover:
             self.tell_scene()
         return Outcome.FAILURE
 
-    def is_over(self, scene: str) -> bool:
-        """Tell whether the scene that called for the change is over while the old module tracks."""
-        is_other = self._verdict.reason == "scene" and scene != self._candidates.scene
-        return is_other and self._estimator.session.health is Health.HELD
+    def why_over(self, scene: str) -> str:
+        """Return why the change that has begun is wanted no longer, now in a scene; "" if it is.
 
-    def give_up(self) -> None:
+        Another scene calls for another first choice, and the old module tracks or it does not want
+        the module that starts at all; or the loss is over: the old module has tracked for as long
+        as it may be lost.
+        """
+        if self._attempt is None:
+            return ""
+        hold, is_held = self._estimator.session.hold, self._estimator.session.health is Health.HELD
+        held_ns = self._estimator.now_ns - (hold.held_since_ns or self._estimator.now_ns)
+        if is_held and self._verdict.reason in _LOSSES and held_ns >= hold.patience_ns:
+            return "the module tracks again"
+        choices = self._candidates.of(scene)
+        if scene == self._candidates.scene or not choices or choices[:1] == self._verdict.to[:1]:
+            return ""
+        is_useless = self._attempt.runner.key not in choices
+        return "the scene is over" if is_held or is_useless else ""
+
+    def give_up(self, why: str) -> None:
         """End the change; the active module stays."""
         self.queue = []
         if self._attempt is not None:
-            self._log_choice("refused", self._attempt.runner.key, why="the scene is over")
+            self._log_choice("refused", self._attempt.runner.key, why=why)
         self._end_attempt()
 
     def tell_scene(self) -> None:
@@ -251,7 +270,10 @@ class Changeover:
 
     def _lead(self, attempt: _Attempt) -> bool | None:
         """Advance one candidate; return whether it took over, None while undecided."""
+        T_new_old = self._estimator.session.T_new_old
         try:
+            if T_new_old is not None and attempt.handover is not None:
+                attempt.handover.move(T_new_old)
             handover = self._caught_up(attempt)
             if handover is not None and attempt.is_trial:
                 handover.settle()
@@ -262,6 +284,8 @@ class Changeover:
             return None
         if handover.fault and self._can_refuse():
             return self._refuse(attempt.runner, handover.fault)
+        if handover.is_unheard and self._estimator.session.hold.is_held and self._can_refuse():
+            return None  # it may be that its sensors give nothing
         self._estimator.accept(handover)
         is_in_vain = None
         if self._now.active and self._now.health is not Health.HELD:  # what it leaves has ended

@@ -64,6 +64,8 @@ class Estimator:
         session, was_placed = self.session, self.session.is_placed
         moment = session.advance(observation, by_velocity=by_velocity, witness=witness)
         self._tell(observation.stamp_ns)
+        if session.T_new_old is not None and was_placed:
+            self._memory.move(session.T_new_old, session.from_ns)
         if session.hold.suspect_since_ns is not None and session.fault is None:
             since_ns = max(session.hold.suspect_since_ns, session.from_ns)
             if was_placed:
@@ -194,20 +196,26 @@ class Estimator:
 
     def _rewrite(self, handover: Handover) -> None:
         """Replace the untrusted poses by those of a module that has caught up."""
-        newest = self._memory.newest
+        newest, trail = self._memory.newest, handover.trail
         before, known = newest.T_map_base, (handover.trail or [handover.anchor])[-1].T_map_base
         jump = se3.identity() if before is None or known is None else se3.inverse(before) @ known
-        if handover.trail:
-            self._back_end.rewind(handover.trail[0].stamp_ns)
-        self._begin_session(newest.stamp_ns, handover.tracked[0].stamp_ns, jump=jump)
+        if trail:
+            self._back_end.rewind(trail[0].stamp_ns)
+        from_ns = handover.tracked[0].stamp_ns
+        posed_ns = next((one.stamp_ns for one in trail if one.T_map_base is not None), from_ns)
+        posed_ns = min(posed_ns, from_ns)
+        self._begin_session(newest.stamp_ns, from_ns, jump=jump, posed_ns=posed_ns)
         for tracking in handover.tracked:
             self._back_end.add_local(tracking.stamp_ns, tracking.T_local_base)
         self._put(handover.trail, newest.stamp_ns)
         self.session.bridge = self._memory.newest.bridge.copy()
 
-    def _begin_session(self, stamp_ns: int, from_ns: int, *, jump: Transform) -> None:
+    def _begin_session(
+        self, stamp_ns: int, from_ns: int, *, jump: Transform, posed_ns: int | None = None
+    ) -> None:
         """Open the active module's session in the back end; it begins at `from_ns`.
 
+        Its first pose, bridged or not, has the stamp `posed_ns`, `from_ns` if it is not given.
         `jump` is the transform from the pose reported at `stamp_ns` to the corrected one.
         """
         assert self.active is not None and self.active.T_map_local is not None
@@ -224,7 +232,7 @@ class Estimator:
             T_map_local=T_map_local.tolist(),
             jump_m=float(np.linalg.norm(jump[:3, 3])),
             jump_rad=float(se3.rotation_angle_rad(jump)),
-            gap_s=0.0 if last_ns is None else (from_ns - last_ns) / 1e9,
+            gap_s=0.0 if last_ns is None else ((posed_ns or from_ns) - last_ns) / 1e9,
         )
 
     def _tell(self, stamp_ns: int) -> None:

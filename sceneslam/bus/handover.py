@@ -60,6 +60,11 @@ class Handover:
         has_data = since_ns is None or self._done_ns - since_ns < hold.patience_ns
         return "" if has_data else "silent"
 
+    @property
+    def is_unheard(self) -> bool:
+        """Tell whether the module has not answered yet."""
+        return self.session.hold.status is None
+
     def tracked_ns(self, stamp_ns: int) -> int:
         """Return how long it has tracked without a break, 0 if not at the newest observation."""
         hold = self.session.hold
@@ -104,6 +109,20 @@ class Handover:
         with self._timed():
             self.session.settle(last, anchor.T_map_base)
         self._first_cost_ns = self._cost_ns
+
+    def move(self, T_new_old: Transform) -> None:
+        """Go on in a map that the module which is left has corrected by (4, 4)."""
+        session = self.session
+        session.bridge = session.bridge.moved(T_new_old)
+        if self._reported is not None:
+            self._reported = T_new_old @ self._reported
+        for moment in self.trail:
+            if moment.T_map_base is not None:
+                moment.T_map_base = T_new_old @ moment.T_map_base
+            moment.bridge = moment.bridge.moved(T_new_old)
+        if session.is_placed:
+            assert self.runner.T_map_local is not None
+            self.runner.place(T_new_old @ self.runner.T_map_local)
 
     @contextmanager
     def _timed(self) -> Iterator[None]:

@@ -135,6 +135,13 @@ class ObservationBuffer:
             moment.observation = known.get(moment.stamp_ns, moment.observation)
             self._append(moment)
 
+    def move(self, T_new_old: Transform, after_ns: int) -> None:
+        """Move the poses after a stamp by the correction (4, 4) of the map."""
+        for moment in self.after(after_ns):
+            if moment.T_map_base is not None:
+                moment.T_map_base = T_new_old @ moment.T_map_base
+            moment.bridge = moment.bridge.moved(T_new_old)
+
     def clear(self) -> None:
         """Remove all entries, to free memory when a finished run is kept for its results."""
         self._moments, self._full, self._bytes = [], [], 0

@@ -37,6 +37,8 @@ class ModuleSession:
     def __init__(self, runner: Runner | None, hold: Hold, bridge: Bridge) -> None:
         self.runner, self.hold, self.bridge = runner, hold, bridge
         self.is_placed = False
+        self._has_gap = False  # a pose was unknown since the last one that was tracked
+        self.T_new_old: Transform | None = None  # how the last answer corrected its past, in map
         self.tracking: Tracking | None = None  # of the last observation, where its pose is used
         self.fault: ModuleError | None = None  # failure at the last observation
         self.stored: list[int] = []  # its sessions in the back end
@@ -78,7 +80,7 @@ class ModuleSession:
         are silent; else `T_prev_curr`, the motion as it was estimated at the time. `witness` says
         what is known of the odometry without the module.
         """
-        self.fault, self.tracking = None, None
+        self.fault, self.tracking, self.T_new_old = None, None, None
         try:
             if is_given and self.is_running:
                 self.tracking = self._ask(observation, witness)
@@ -87,7 +89,7 @@ class ModuleSession:
                     self.runner.skip(observation)
                 self.hold.spare(observation)
             if self.tracking is not None:
-                T_map_tracked = self._place(observation, self.tracking)
+                T_map_tracked = self._place(observation, self.tracking, T_prev_curr)
                 self.tracking = self.doubted(self.tracking)
                 return self._moment(observation, T_map_tracked, witness)
         except ModuleError as error:
@@ -98,6 +100,7 @@ class ModuleSession:
         T_map_base = self.predict(
             self.bridge, observation, by_velocity=by_velocity or is_silent, T_prev_curr=T_prev_curr
         )
+        self._has_gap |= T_map_base is None
         return self._moment(observation, T_map_base, witness)
 
     def predict(
@@ -134,15 +137,24 @@ class ModuleSession:
             self.is_placed = self.is_acquitted  # where it was before
         return tracking
 
-    def _place(self, observation: Observation, tracking: Tracking) -> Transform:
+    def _place(
+        self, observation: Observation, tracking: Tracking, T_prev_curr: Transform | None
+    ) -> Transform:
         """Return T_map_base; a module's first pose is the bridged one, handed over (Eq. 1)."""
         if not self.is_placed:
             T_map_base = self.bridge.predict(self._believed(observation), by_velocity=True)
-            self.settle(tracking, T_map_base)
+            if T_map_base is None and T_prev_curr is not None:
+                T_map_base = self.bridge.follow(observation, T_prev_curr)
+            self.settle(tracking, None if self._has_gap else T_map_base)
             self.is_placed = True
         assert self.runner is not None and self.runner.T_map_local is not None
         T_map_base = self.runner.T_map_local @ tracking.T_local_base
+        if self.hold.is_revised:
+            T_map_old = self.bridge.copy().predict(self._believed(observation), by_velocity=True)
+            T_map_old = self.bridge.T_map_base if T_map_old is None else T_map_old
+            self.T_new_old = T_map_base @ se3.inverse(T_map_old)
         self.bridge.update(observation, T_map_base, is_jump=self.hold.is_revised)
+        self._has_gap = False
         return T_map_base
 
     def settle(self, tracking: Tracking, T_map_base: Transform | None) -> None:

@@ -174,7 +174,10 @@ class Gate:
         )
         if self._samples:
             judgement = self._judge(now, deviation_m, witness)
-            self.lie_until_ns = stamp_ns + _HORIZONS_NS[-1] if judgement.wheels_lie else -1
+            if judgement.wheels_lie:
+                self.lie_until_ns = stamp_ns + _HORIZONS_NS[-1]
+            elif judgement.is_trusted:  # over a horizon: less shows no slow slip
+                self.lie_until_ns = -1
         else:
             judgement = self._begin(now)
         self._samples.append(now)
