@@ -39,6 +39,7 @@ from sceneslam.config.words import (
 from sceneslam.detection.run import detect
 from sceneslam.doctor import examine
 from sceneslam.evaluation.report.summary import summary_lines
+from sceneslam.evaluation.shortfalls import REFERENCE
 from sceneslam.evaluation.verdict import verdict_lines
 from sceneslam.experiment import run_experiment
 from sceneslam.storage.folder import give_back
@@ -236,12 +237,12 @@ def _run(config: DictConfig, folder: Path) -> Finished:
     if config.get("reference"):
         finished = run(_reference(config), folder / "reference", title="reference")
         if finished.faults:
-            faults = tuple(f"reference: {fault}" for fault in finished.faults)
+            faults = tuple(f"{REFERENCE}{fault}" for fault in finished.faults)
             return replace(finished, faults=faults)
         if finished.is_stop_requested:
             raise KeyboardInterrupt(f"{_UNBEGUN}; the reference is saved")
         reference = finished.trajectory
-        partial = tuple(f"reference: {one}" for one in finished.metrics["shortfalls"])
+        partial = tuple(f"{REFERENCE}{one}" for one in finished.metrics["shortfalls"])
     own = run(resolved(config), folder, title=title, reference=reference, say=_say_before)
     return replace(own, faults=(*partial, *own.faults))
 

@@ -30,6 +30,7 @@ from sceneslam.config.settings import DETECT_ONLY
 from sceneslam.config.words import check_trust
 from sceneslam.detection.run import detect
 from sceneslam.evaluation.report.verdict_page import Asked, Ran, write_verdict_page
+from sceneslam.evaluation.shortfalls import NO_POSE
 from sceneslam.evaluation.verdict import write_verdict
 from sceneslam.interfaces import Experiment
 from sceneslam.interrupts import terminate_with
@@ -199,7 +200,7 @@ def _run_unless_finished(config: dict[str, Any], folder: Path, name: str) -> Non
         if finished.is_interrupted:
             raise KeyboardInterrupt(f"stopped during the trial {name}")
         faults, is_stop_requested = finished.faults, finished.is_stop_requested
-        is_final = set(faults) <= set(finished.input_faults)
+        is_final = all(one in finished.input_faults or one.startswith(NO_POSE) for one in faults)
         if lost := [one for one in _READ if not (folder / one).is_file()]:
             raise InputError(f"{lost[0]} of a trial is missing: {'; '.join(faults)}: {folder}")
     end = {"made_by": made_by, "faults": faults, "is_final": is_final}

@@ -24,6 +24,7 @@ from sceneslam.engine.live import LiveTally, Spent, StepInterrupt, run_live
 from sceneslam.engine.open_sinks import OpenSinks
 from sceneslam.engine.slowest import Stopwatch
 from sceneslam.engine.steering import Operator
+from sceneslam.evaluation.shortfalls import NO_POSE
 from sceneslam.executors import executor
 from sceneslam.interfaces import Live, LiveFeed, closes_own_loops
 from sceneslam.keeping import Keeping
@@ -131,7 +132,7 @@ class RunLoop:
         self.faults += self._parts.atlas.finish()
         self._add_covariances()
         if not len(self._parts.atlas.online) and not self.faults:
-            self.faults.append(self._why_no_pose())
+            self.faults.append(f"{NO_POSE}{self._why_no_pose()}")
         self.faults += self._parts.source.faults
         self._keeping.finish()
 
@@ -330,11 +331,11 @@ class RunLoop:
 
     def _why_no_pose(self) -> str:
         if not self._observed_ns:
-            return "no pose: the source gave no observation"
+            return "the source gave no observation"
         if self._bus.state == "init" or not self._bus.scene:
-            return "no pose: no scene was confirmed (policy.first_confirm_window_s, detector)"
+            return "no scene was confirmed (policy.first_confirm_window_s, detector)"
         tried = [str(e["to"]) for e in self._log.events if e["event"] in ("decision", "refused")]
         names = " and ".join(dict.fromkeys(tried)) or self._bus.active or "none"
-        said = f"no pose: module {names} was lost from the first observation on"
+        said = f"module {names} was lost from the first observation on"
         said = f"{said}; {self._tally.words()}"
         return f"{said}. Most likely: {'; '.join(self._warnings)}" if self._warnings else said

@@ -234,12 +234,16 @@ def test_a_trial_whose_metrics_could_not_be_saved_is_run_again(tmp_path, monkeyp
     assert (tmp_path / "metrics.json").is_file() and (tmp_path / "finished.json").is_file()
 
 
+NOWHERE = {"_target_": "fakes.ExactModule", "lost": list(range(100))}
+
+
 @pytest.mark.parametrize(
     ("changes", "cause", "is_again"),
     [
         ({}, "sceneslam.results.save_map", True),
         ({"source__breaks_at": 70}, None, True),
         ({"source__fault": "damaged at 2 s"}, None, False),
+        ({"slam__bright": NOWHERE, "slam__dark": NOWHERE}, None, False),
         ({}, None, False),
     ],
 )

@@ -15,11 +15,13 @@ from pathlib import Path
 from time import monotonic, sleep
 
 import pytest
+from configured import config
 from hydra import compose, initialize_config_module
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
+from sceneslam.app import run
 from sceneslam.collect.rows import read_rows
 from sceneslam.collect.status import State, Status
 from sceneslam.config.check import check_keys, check_maps_apart
@@ -161,7 +163,9 @@ def ended(sweep, *states):
 def lacking(folder, *, faults=(), error="only 8 % got a pose"):
     """Give a job that ended with these failures of modules, and this error, its metrics."""
     metrics = {"faults": list(faults), "shortfalls": ["only 8 % got a pose"]}
-    (folder / "metrics.json").write_text(json.dumps(metrics))
+    for place in (folder, folder / "reference"):
+        place.mkdir(exist_ok=True)
+        (place / "metrics.json").write_text(json.dumps(metrics))
     Status(state=State.INCOMPLETE, error=error, overrides=[f"a={folder.name}"]).write(folder)
 
 
@@ -188,6 +192,22 @@ def test_job_that_a_cause_of_the_moment_left_incomplete_is_run_again(tmp_path, w
     assert not run_sweep(tmp_path, folders, {"backend": "basic"}, tmp_path)
     assert Status.read(folders[0]).state is State.DONE
     assert Status.read(folders[1]).state is State.FAILED  # it ran: there is nothing to run here
+
+
+def test_job_that_lacks_poses_as_its_reference_does_is_final(tmp_path):
+    error = "reference: only 8 % got a pose; only 8 % got a pose"
+    lacking(tmp_path, error=error)
+    assert Status.read(tmp_path).is_final(tmp_path)
+    lacking(tmp_path, error=f"reference: slam.dark failed once; {error}")
+    assert not Status.read(tmp_path).is_final(tmp_path)
+
+
+def test_job_without_any_pose_is_final(tmp_path):
+    lost = {"_target_": "fakes.ExactModule", "lost": list(range(200))}
+    ran = run(config(slam__bright=lost, slam__dark=lost, run__report=False), tmp_path)
+    errors = [*ran.faults, *ran.metrics["shortfalls"]]
+    status = Status(state=State.INCOMPLETE, error="; ".join(errors))
+    assert len(errors) == 1 and status.is_final(tmp_path)
 
 
 @pytest.mark.parametrize("how", ["command", "resume"])

@@ -10,6 +10,7 @@ from enum import Enum
 from pathlib import Path
 from typing import Any
 
+from sceneslam.evaluation.shortfalls import NO_POSE, REFERENCE
 from sceneslam.types.errors import InputError
 
 _FILE = "job.json"
@@ -57,10 +58,13 @@ class Status:
         if self.state is not State.INCOMPLETE:
             return self.state is State.DONE
         try:
-            metrics = json.loads((folder / "metrics.json").read_text())
-            return not metrics["faults"] and self.error == "; ".join(metrics["shortfalls"])
+            said = _missing_poses(folder)
+            if self.error.startswith(REFERENCE):
+                of_reference = _missing_poses(folder / "reference")
+                said = [*(f"{REFERENCE}{one}" for one in of_reference), *said]
         except (OSError, KeyError, TypeError, ValueError):
             return False
+        return self.error == "; ".join(said)
 
     def now(self, state: State, error: str = "", **values: Any) -> Status:
         """Return the same job in another state."""
@@ -83,3 +87,10 @@ class Status:
             return cls(**values | {"state": State(values["state"])})
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(f"not the status of a job ({error!r}): {path}") from error
+
+
+def _missing_poses(folder: Path) -> list[str]:
+    """Return what a run says of missing poses; nothing if a module failed in it."""
+    metrics = json.loads((folder / "metrics.json").read_text())
+    without = [one for one in metrics.get("errors", ()) if one.startswith(NO_POSE)]
+    return [] if metrics["faults"] else [*without, *metrics["shortfalls"]]

@@ -9,6 +9,9 @@ import numpy as np
 from sceneslam.evaluation.gaps import in_words, why_without_pose
 from sceneslam.types.run import Event, RunResult
 
+NO_POSE = "no pose: "  # begins the error of a run without any pose, before its reason
+REFERENCE = "reference: "  # begins the errors of the run that a run is compared with
+
 
 def shortfalls(result: RunResult, coverage_min_ratio: float) -> list[str]:
     """Return a sentence per failed module, and one if too few observations got a pose."""
