@@ -78,7 +78,9 @@ def checked_trajectory(trajectory: object) -> Trajectory:
     _check_shape("T_world_base", T_world_base, (len(stamps_ns), 4, 4))
     _check_rigid("T_world_base", T_world_base)
     return Trajectory(
-        stamps_ns=stamps_ns.astype(np.int64), T_world_base=T_world_base.astype(np.float64)
+        stamps_ns=stamps_ns.astype(np.int64),
+        T_world_base=T_world_base.astype(np.float64),
+        covariances=_covariances(trajectory.covariances, len(stamps_ns)),
     )
 
 
@@ -162,6 +164,18 @@ def _check_rigid(name: str, T_a_b: NDArray[np.float64]) -> None:
     far_m = np.abs(T_a_b[..., :3, 3]).max(initial=0.0)
     if far_m > _FAR_M or (T_a_b[..., 3, :] != (0, 0, 0, 1)).any():
         raise ValueError(f"{name}: expected a place on Earth and a last row of 0 0 0 1")
+
+
+def _covariances(covariances: object, count: int) -> NDArray[np.float64] | None:
+    """Return a copy of covariances (N, 6, 6), NaN where a pose has none; None without any."""
+    if covariances is None:
+        return None
+    matrices = np.array(_of("covariances", covariances, np.ndarray), np.float64)
+    _check_shape("covariances", matrices, (count, 6, 6))
+    known = ~np.isnan(matrices).all(axis=(1, 2))
+    if not np.isfinite(matrices[known]).all():
+        raise ValueError("covariances: expected finite numbers, or NaN in all of a row")
+    return matrices
 
 
 def _covariance(name: str, covariance: object) -> NDArray[np.float64] | None:

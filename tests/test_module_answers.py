@@ -97,6 +97,18 @@ def test_stamps_of_a_trajectory_increase():
         checked_trajectory(Trajectory(stamps_ns=np.array([1, 2, 2]), T_world_base=poses))
 
 
+def test_covariances_of_a_trajectory_are_numbers_or_missing():
+    poses, known = np.tile(np.eye(4), (2, 1, 1)), np.tile(np.eye(6), (2, 1, 1))
+    given = Trajectory(stamps_ns=np.arange(2), T_world_base=poses, covariances=known)
+    known[0] = np.nan
+    np.testing.assert_array_equal(checked_trajectory(given).covariances, known)
+    with pytest.raises(ValueError, match="covariances"):
+        checked_trajectory(replace(given, covariances=known[:1]))
+    known[1, 2, 3] = np.inf
+    with pytest.raises(ValueError, match="covariances"):
+        checked_trajectory(given)
+
+
 def test_a_trajectory_of_narrow_numbers_is_kept_as_the_journal_is_read(tmp_path):
     poses = np.tile(np.eye(4, dtype=np.float32), (3, 1, 1))
     given = Trajectory(stamps_ns=np.arange(3, dtype=np.int32), T_world_base=poses)

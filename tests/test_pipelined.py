@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from fakes import PERIOD_NS, RIG, observation, true_pose
 
+from sceneslam.answers import checked_trajectory
+from sceneslam.atlas.atlas import Atlas
 from sceneslam.modules.slam.pipelined import Pipelined
 from sceneslam.motion.late import Pipeline
 from sceneslam.motion.model import MotionModel
@@ -18,6 +20,7 @@ from sceneslam.types.errors import ConfigError
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import Tracking, TrackingStatus
 from sceneslam.types.rig import Sensor, Wheels
+from sceneslam.types.run import BRIDGED
 from sceneslam.types.trajectory import Trajectory
 
 
@@ -137,6 +140,60 @@ def test_contract_of_a_slam_module_is_kept_by_a_system_that_is_three_images_late
             return poses
 
     check_module(lambda: Pipelined(Behind(), late_max_s=0.5))
+
+
+class Late(Exact):
+    """Knows every pose to 1 cm and 10 mrad, and gives it `lag` observations later."""
+
+    def __init__(self, lag, is_revised=False):
+        super().__init__()
+        self._lag, self._is_revised = lag, is_revised
+
+    def activate(self, rig):
+        super().activate(rig)
+        self._known = []
+
+    def feed(self, seen):
+        known = Tracking(
+            stamp_ns=seen.stamp_ns,
+            T_local_base=true_pose(seen.stamp_ns),
+            status=TrackingStatus.TRACKING,
+            covariance=0.01**2 * np.eye(6),
+        )
+        self._known.append(known)
+        ready = len(self._known) - self._lag
+        return self._known[max(ready - 1, 0) : max(ready, 0)]
+
+    def get_trajectory(self):
+        known = self._known if self._is_revised else []
+        stamps_ns = np.array([one.stamp_ns for one in known], np.int64)
+        poses = np.array([one.T_local_base for one in known]).reshape(-1, 4, 4)
+        return Trajectory(stamps_ns=stamps_ns, T_world_base=poses)
+
+
+def deviations_m(system, *, has_odometry=True, steps=60):
+    """Return the standard deviations (N,) along x of the poses of a run with a system."""
+    module, atlas = Pipelined(system, 0.5), Atlas(voxel_m=0.05)
+    module.activate(RIG)
+    session = atlas.begin_session("late", se3.identity())
+    for index in range(steps):
+        answer = module.track(observation(index, has_odometry=has_odometry))
+        is_lost = answer.status is TrackingStatus.LOST
+        if not is_lost:
+            atlas.add_local(answer.stamp_ns, answer.T_local_base)
+        name = BRIDGED if is_lost else "late"
+        atlas.add(answer.stamp_ns, answer.T_local_base, name, answer.covariance)
+    atlas.close_session(session, MapLayers(), checked_trajectory(module.get_trajectory()))
+    return np.sqrt(atlas.covariances(has_odometry)[:, 0, 0])
+
+
+@pytest.mark.parametrize("has_odometry", [False, True])
+@pytest.mark.parametrize("is_revised", [False, True])
+def test_a_pose_that_came_late_is_as_certain_as_its_answer(has_odometry, is_revised):
+    in_time = deviations_m(Late(0))
+    late = deviations_m(Late(4, is_revised), has_odometry=has_odometry)
+    np.testing.assert_allclose(late[5:56], in_time[5:56], rtol=0.02)
+    assert late[-1] > 1.1 * in_time[-1]  # nothing answered for it
 
 
 def test_impossible_patience_is_refused():

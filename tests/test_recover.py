@@ -7,7 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -185,7 +185,11 @@ def told_atlas(journal, seed):
         if kind == 1:
             atlas.rewind(stamp_ns - 50)
         if kind == 2:
-            atlas.close_session(session, None, atlas.online)
+            revised = atlas.online
+            known = np.tile(draw.uniform() * np.eye(6), (len(revised), 1, 1))
+            known[::3] = np.nan
+            covariances = known if draw.integers(2) else None
+            atlas.close_session(session, None, replace(revised, covariances=covariances))
         if kind == 4:
             nodes_ns = np.unique(draw.integers(0, stamp_ns, size=5))
             moved = np.array([se3.exp(draw.normal(size=6)) for _ in nodes_ns])
@@ -269,7 +273,7 @@ def test_a_record_that_cannot_be_read_costs_no_other(tmp_path):
     journal.close()
     kept = read_journal(tmp_path / "journal.bin", _Retold(Atlas(voxel_m=0.1)))
     assert kept.observed_ns.tolist() == list(range(0, 3010, 10))
-    assert kept.torn_bytes == 9 + 8 + 5 * (8 + 12 * 4)
+    assert kept.torn_bytes == 9 + 9 + 5 * (8 + 12 * 4)
 
 
 def test_a_journal_takes_at_most_450_bytes_a_pose(tmp_path):

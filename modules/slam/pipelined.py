@@ -58,8 +58,7 @@ class Pipelined(LocalModule):
 
     def get_trajectory(self) -> Trajectory:
         """Return the system's revised poses, else those that came late, if any."""
-        revised = self._system.get_trajectory()
-        return revised if len(revised) else self._pipeline.trajectory()
+        return self._pipeline.trajectory(self._system.get_trajectory())
 
     def get_map(self) -> MapLayers:
         """Return the system's map."""

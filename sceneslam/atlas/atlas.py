@@ -266,7 +266,7 @@ class Atlas:
             T_map_base=self.trajectory.T_world_base,
             sessions=np.array(self._path.sessions, np.int64),
             is_bridged=np.array(self._path.modules) == BRIDGED,
-            reported=self._path.reported(),
+            reported=self._path.reported([session.revised for session in self._sessions]),
             of_maps=self._path.of_maps(),
         )
         path = calibrated(

@@ -142,18 +142,33 @@ class PosePath:
                 )
         return list(starts.values())
 
-    def reported(self) -> NDArray[np.float64]:
-        """Return the covariances (N, 6, 6) in the modules' maps, as `_semidefinite` has them."""
-        return _semidefinite(self._covariances)
+    def reported(self, revised: Sequence[Trajectory]) -> NDArray[np.float64]:
+        """Return the covariances (N, 6, 6) in the modules' maps, as `_semidefinite` has them.
+
+        Of a pose that its module revised (`revised` is by session) it is what came with that.
+        """
+        triangles = np.asarray(self._covariances)
+        stamps_ns, sessions = np.array(self.stamps_ns, np.int64), np.array(self.sessions, np.int64)
+        for session, one in enumerate(revised):
+            if one.covariances is None:
+                continue
+            own = np.flatnonzero(sessions == session)
+            known = ~np.isnan(one.covariances[:, 0, 0])
+            _, rows, given = np.intersect1d(
+                stamps_ns[own], one.stamps_ns[known], return_indices=True
+            )
+            covariances = triangle(one.covariances[known][given])
+            triangles[own[rows]] = np.clip(covariances, -_UNKNOWN, _UNKNOWN)
+        return _semidefinite(triangles)
 
     def of_maps(self) -> NDArray[np.float64]:
         """Return the covariances (N, 6, 6) of the modules' maps, as `_semidefinite` has them."""
-        return _semidefinite(self._maps)
+        return _semidefinite(np.asarray(self._maps))
 
 
-def _semidefinite(rows: Rows) -> NDArray[np.float64]:
+def _semidefinite(triangles: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return reported covariances (N, 6, 6), positive semidefinite; NaN: not reported."""
-    covariances = symmetric(np.asarray(rows))
+    covariances = symmetric(triangles)
     given = ~np.isnan(covariances[:, 0, 0])
     covariances[given] = semidefinite(covariances[given])
     return covariances

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from sceneslam.motion.model import MotionModel
 from sceneslam.motion.motion import still
 from sceneslam.types import se3
+from sceneslam.types.covariance import TRIANGLE, symmetric, triangle
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
 from sceneslam.types.rig import Rig, Sensor, Wheels
 from sceneslam.types.rows import Rows
@@ -38,6 +40,7 @@ class Pipeline:
         self._twist_s, self._kept_revision = np.zeros(6), 0
         self._step_s = 0.0  # over which the twist was measured; 0: it was not
         self._stamps_ns, self._poses = array("q"), Rows(4, 4)  # T_local_base, as it was answered
+        self._covariances = Rows(TRIANGLE)  # of these poses, NaN: not reported
 
     def note(self, observation: Observation) -> None:
         """Record an observation that was given to the program."""
@@ -113,13 +116,22 @@ class Pipeline:
         T_now_newest = se3.inverse(self._T_local_base) @ self._newest.T_local_base
         return se3.carried(covariance, T_now_newest)
 
-    def trajectory(self) -> Trajectory:
-        """Return T_local_base as the program gave it; empty if no answer was late."""
-        if not self._is_late or not self._stamps_ns:
-            return Trajectory.empty()
-        return Trajectory(
-            stamps_ns=np.array(self._stamps_ns, np.int64), T_world_base=np.asarray(self._poses)
-        )
+    def trajectory(self, revised: Trajectory) -> Trajectory:
+        """Return T_local_base as the program revised it, else as it answered if any was late.
+
+        If any was late, the poses have the covariances of their answers.
+        """
+        if not self._is_late or revised.covariances is not None:
+            return revised
+        stamps_ns = np.array(self._stamps_ns, np.int64)
+        answered = symmetric(np.asarray(self._covariances))
+        if not len(revised):
+            poses = np.asarray(self._poses)
+            return Trajectory(stamps_ns=stamps_ns, T_world_base=poses, covariances=answered)
+        _, rows, own = np.intersect1d(revised.stamps_ns, stamps_ns, return_indices=True)
+        covariances = np.full((len(revised), 6, 6), np.nan)
+        covariances[rows] = answered[own]
+        return replace(revised, covariances=covariances)
 
     def _carry_on(self, observation: Observation) -> TrackingStatus:
         """Extend the newest pose to an observation without an answer."""
@@ -146,4 +158,6 @@ class Pipeline:
             self._twist_s = se3.log(T_prev_curr) / self._step_s
         self._stamps_ns.append(answer.stamp_ns)
         self._poses.append(answer.T_local_base)
+        known = answer.covariance
+        self._covariances.append(np.full(TRIANGLE, np.nan) if known is None else triangle(known))
         self._kept_revision = answer.revision

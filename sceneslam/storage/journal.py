@@ -13,7 +13,7 @@
 | `R` | stamp from which on poses are taken back |
 | `M` | stamps and T_new_old at which the atlas corrects the poses otherwise than before |
 | `F` | the same of the end: all of it, of the poses as their modules revised them |
-| `C` | a session's number; stamps and T_local_base as its module revised them at its end |
+| `C` | number of a session, a byte 1 (0: no covariances); revised stamps, poses and covariances |
 
 A pose takes about 410 bytes, 580 with a covariance of the map. The file goes when the run's results
 are written.
@@ -26,7 +26,7 @@ import struct
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -40,7 +40,7 @@ from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import Trajectory
 
 JOURNAL = "journal.bin"
-MAGIC = b"SceneSLAM journal 3\n"
+MAGIC = b"SceneSLAM journal 4\n"
 _HEAD = struct.Struct("<cII")
 _STAMP = struct.Struct("<q")
 _POSE_BYTES = 12 * 8
@@ -115,8 +115,10 @@ class Journal:
 
     def add_end(self, session: int, revised: Trajectory) -> None:
         """Record the revised trajectory of a session."""
-        poses = _poses(revised.stamps_ns, revised.T_world_base)
-        self._add(b"C", _STAMP.pack(session) + poses)
+        known = revised.covariances
+        body = _STAMP.pack(session) + (b"\0" if known is None else b"\1")
+        body += _poses(revised.stamps_ns, revised.T_world_base)
+        self._add(b"C", body if known is None else body + triangle(known).tobytes())
 
     def flush(self) -> None:
         """Pass all records to the operating system."""
@@ -225,7 +227,14 @@ def _tell_final(log: TrajectoryLog, body: bytes) -> None:
 
 
 def _tell_end(log: TrajectoryLog, body: bytes) -> None:
-    log.add_end(_number(body), _trajectory(body[_STAMP.size :]))
+    has_covariances, rest = body[_STAMP.size], body[_STAMP.size + 1 :]
+    if not has_covariances:
+        log.add_end(_number(body), _trajectory(rest))
+        return
+    each = _STAMP.size + _POSE_BYTES
+    end = len(rest) // (each + 8 * TRIANGLE) * each  # of the poses
+    covariances = symmetric(np.frombuffer(rest[end:]).reshape(-1, TRIANGLE))
+    log.add_end(_number(body), replace(_trajectory(rest[:end]), covariances=covariances))
 
 
 _TELL = {

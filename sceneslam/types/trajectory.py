@@ -23,6 +23,8 @@ class Trajectory:
 
     stamps_ns: NDArray[np.int64]  # (N,)
     T_world_base: NDArray[np.float64]  # (N, 4, 4)
+    # (N, 6, 6) in base, as `Tracking` has them; None, or NaN in a row: as reported before.
+    covariances: NDArray[np.float64] | None = None
 
     def __len__(self) -> int:
         return len(self.stamps_ns)

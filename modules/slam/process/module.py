@@ -132,9 +132,9 @@ class ProcessSlam(LocalModule, Restarted[Program]):
     def get_trajectory(self) -> Trajectory:
         """Return the program's revised poses, else those that came late, if any."""
         if not self._is_active:
-            return self._pipeline.trajectory()
+            return self._pipeline.trajectory(Trajectory.empty())
         revised = self._ask("trajectory", {}, self._limits.start_deadline_s, trajectory)
-        return revised if len(revised.stamps_ns) else self._pipeline.trajectory()
+        return self._pipeline.trajectory(revised)
 
     def get_map(self) -> MapLayers:
         """Return the program's map in `local`; the last one after `shutdown`."""
