@@ -14,7 +14,7 @@ from sceneslam.atlas.lasting.prune import prune
 from sceneslam.atlas.lasting.saved_map import SavedMap, empty_map, forget_contradicted
 from sceneslam.atlas.places.floor_plan import join
 from sceneslam.atlas.places.recognition import Recognizer
-from sceneslam.atlas.submaps.graph import on_floor
+from sceneslam.atlas.submaps.graph import connected, on_floor
 from sceneslam.atlas.submaps.submap import Drawing, Submap
 from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.maps.__main__ import main
@@ -224,6 +224,27 @@ def test_what_was_connected_stays_so_whatever_is_removed(seed):
         edges[number] = replace(one, T_first_second=planar.to_transform(motion))
     thinned = prune(map_of(*[WALL] * 10, nodes=nodes, edges=edges))
     assert len(thinned.submaps) == 5 and flaws(thinned) == []
+
+
+@pytest.mark.parametrize("has_tie", [False, True])
+def test_loops_through_a_removed_submap_measure_though_nothing_measured_the_way_to_it(has_tie):
+    """Submap 5 is a piece of its own, which loops join with those before and after."""
+    nodes = np.array([[5.0 * index, 0, 0] for index in range(10)])
+    pairs = [(row, row + 1) for row in range(9)] + [(2, 5), (3, 5), (5, 7), (5, 8)]
+    edges = [
+        edge(*pair, planar.between(*nodes[list(pair)]), kind=LOOP if row > 8 else EdgeKind.MOTION)
+        for row, pair in enumerate([*pairs, (3, 7)])
+    ]
+    for row in (4, 5, 13):  # ties
+        edges[row] = replace(edges[row], covariance=1e4 * np.eye(6), kind=EdgeKind.HANDOVER)
+    plans = [WALL] * 5 + [join([])] + [WALL] * 4
+    thinned = prune(map_of(*plans, nodes=nodes, edges=edges if has_tie else edges[:-1]))
+    assert len(thinned.submaps) == 9
+    measured = [one for one in thinned.edges if one.covariance[0, 0] < 1.0]
+    across = [one for one in measured if one.first < 5 <= one.second]
+    ends = sorted((one.first, one.second, one.kind) for one in across)
+    assert ends == [(2, 6, LOOP), (3, 6, LOOP)]
+    assert len(connected(range(9), measured)) == 1 and flaws(thinned) == []
 
 
 # What is joined.

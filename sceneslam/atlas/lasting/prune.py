@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sceneslam.atlas.lasting.saved_map import SavedMap
 from sceneslam.atlas.places.floor_plan import join
 from sceneslam.atlas.places.plan_field import PlanField
+from sceneslam.atlas.submaps.chain import is_guessed
 from sceneslam.graphs.edge import Edge
 from sceneslam.types import planar
 from sceneslam.views.placed_views import are_covered
@@ -66,16 +67,22 @@ def _is_most(shown: NDArray[np.bool_]) -> bool:
 def _without(edges: Sequence[Edge], node: int) -> list[Edge]:
     """Return the edges without a node; those to it are composed, so that its neighbours connect.
 
-    All its neighbours are linked with the one whose edge is the most certain, a motion if possible.
+    All its neighbours are linked with the one whose edge is the most certain: a motion if one was
+    measured, else a loop. What measures nothing comes last, and stands in no loop's way.
     """
     ends = [edge for edge in edges if node in (edge.first, edge.second)]
     left = [edge for edge in edges if node not in (edge.first, edge.second)]
     own = [edge if edge.first == node else edge.turned() for edge in ends]
-    own.sort(key=lambda edge: (edge.is_loop, float(np.trace(edge.covariance))))
+    own.sort(key=lambda edge: (*_rank(edge), float(np.trace(edge.covariance))))
     for edge in own[1:]:
         bridge = own[0].turned().then(edge)
         pair = {bridge.first, bridge.second}
         same = [one for one in left if {one.first, one.second} == pair]
-        if len(pair) == 2 and all(one.is_loop and not bridge.is_loop for one in same):
+        if len(pair) == 2 and all(_rank(bridge) < _rank(one) for one in same):
             left.append(bridge if bridge.first < bridge.second else bridge.turned())
     return left
+
+
+def _rank(edge: Edge) -> tuple[bool, bool]:
+    """Return a key that sorts edges: measured motions, loops, and what nothing measured."""
+    return is_guessed(edge.covariance), edge.is_loop
