@@ -101,19 +101,23 @@ def chosen(module: str, mrpt: Path | None) -> list[str]:
 
 def run(recording: Recording, module: str, data: Path, mrpt: Path | None) -> list[str]:
     """Return a row of the table."""
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as own:
+        folder = Path(own, "run")
         command = [
             sys.executable, "-m", "sceneslam", "+scenario=single",
             *(part.format(data=data) for part in recording.source),
             *chosen(module, mrpt),
             "run.progress=false", "run.report=false", f"hydra.run.dir={folder}",
         ]  # fmt: skip
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
-        assert process.stdout is not None
-        said = process.stdout.read().decode(errors="replace")
-        _, status, spent = os.wait4(process.pid, 0)
-        process.returncode = os.waitstatus_to_exitcode(status)
-        metrics = Path(folder) / "metrics.json"
+        environment = os.environ | {"SCENESLAM_CACHE_DIR": own}  # else a second one reads nothing
+        with subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, env=environment
+        ) as process:
+            assert process.stdout is not None
+            said = process.stdout.read().decode(errors="replace")
+            _, status, spent = os.wait4(process.pid, 0)
+            process.returncode = os.waitstatus_to_exitcode(status)
+        metrics = folder / "metrics.json"
         if not metrics.is_file():
             raise SystemExit(f"{module}: no metrics\n{said}")
         found = json.loads(metrics.read_text())
@@ -126,7 +130,7 @@ def run(recording: Recording, module: str, data: Path, mrpt: Path | None) -> lis
         else:
             relations = Relations.read(Path(recording.relations.format(data=data)))
             names = ("trajectory_online.tum", "trajectory.tum")
-            poses = [read_poses(Path(folder) / name) for name in names]
+            poses = [read_poses(folder / name) for name in names]
             errors_m = [relation_errors(one, relations)["trans_mean_m"] for one in poses]
         shown = ["-" if one is None else f"{one:.3f}" for one in errors_m]
         coverage = f"{100 * found['coverage']:.1f}"

@@ -21,6 +21,7 @@ from sceneslam.config.resolve import resolved
 from sceneslam.detection.features import RecordingFeatures
 from sceneslam.detection.grid import Axis, try_all
 from sceneslam.detection.run import _shares, detect
+from sceneslam.experiments import side_by_side
 from sceneslam.types.errors import ConfigError, ModuleError
 from sceneslam.types.files import AppendedFile
 from sceneslam.types.observation import SceneVote
@@ -290,6 +291,13 @@ def test_command_sweeps_settings_and_recordings_into_one_table(cache, tmp_path):
     failed = [row for row in rows if row["status"] == "failed"]
     assert len(failed) == 10 and {row["policy.confirm_window_s"] for row in failed} == {"-1"}
     assert (tmp_path / "out" / "index.html").is_file()
+
+
+def test_reading_that_is_measured_takes_no_cached_features(tmp_path, recording, monkeypatch):
+    monkeypatch.setenv("SCENESLAM_CACHE_DIR", str(tmp_path / "cache"))
+    room = side_by_side.Recording(source=("source=mcap", f"source.path={recording}"), modules=())
+    assert side_by_side.run(room, "reading", tmp_path, None)[0] == "reading"
+    assert not (tmp_path / "cache").exists()
 
 
 def test_one_limit_of_a_rule_and_places_of_lists_are_swept(config):
