@@ -143,7 +143,7 @@ class TfNode:
     T_odom_base = se3.from_xy_yaw(50.0, 0.0, 0.3)
 
     def __init__(self, **settings):
-        self._heard, self._index = {}, 0
+        self._heard, self._stamp_ns = {}, 0
         transport = SimpleNamespace(
             subscribe=lambda topic, kind, hear, qos: self._heard.update({topic: hear}),
             publisher=lambda *topic: SimpleNamespace(publish=lambda cdr: None),
@@ -161,20 +161,42 @@ class TfNode:
         cdr = Encoder().transforms(0, "map", {"odom": T_map_odom})
         self._heard["/tf"](Arrival(topic="/tf", cdr=cdr, arrived_ns=0))
 
-    def track(self):
-        self._index += 1
-        observation = {"stamp_ns": np.array(self._index), "T_odom_base": self.T_odom_base}
+    def track(self, after_s=0.1):
+        self._stamp_ns += round(after_s * 1e9)
+        observation = {"stamp_ns": np.array(self._stamp_ns), "T_odom_base": self.T_odom_base}
         return self._client.track(observation)
 
 
 @pytest.mark.parametrize(("closes_loops", "counted"), [(True, [0, 0, 1, 1, 2]), (False, [0] * 5)])
 def test_a_jump_of_map_to_odom_is_a_revision_of_a_node_that_closes_loops(closes_loops, counted):
     node, found = TfNode(closes_loops=closes_loops), []
-    for x_m, yaw_deg in ((0.0, 0.0), (0.05, 0.0), (0.85, 0.0), (0.85, 0.5), (0.85, 3.5)):
+    for x_m, yaw_deg, after_s in (
+        (0.0, 0.0, 0.1),
+        (0.05, 0.0, 0.1),
+        (0.85, 0.0, 0.1),
+        (0.85, 0.5, 5.0),
+        (0.85, 3.5, 0.1),
+    ):
         T_turn = se3.from_xy_yaw(0.0, 0.0, np.radians(yaw_deg))  # about the robot, not about odom
         T_map_base = se3.from_xy_yaw(x_m, 0.0, 0.0) @ node.T_odom_base @ T_turn
         node.publish(T_map_base @ se3.inverse(node.T_odom_base))
-        found.append(int(node.track()["revision"]))
+        found.append(int(node.track(after_s)["revision"]))
+    assert found == counted
+
+
+@pytest.mark.parametrize(
+    ("x_m", "after_s", "counted"),
+    [
+        ([0.0, 0.5, 0.0, 0.5, 0.0], 0.5, [0, 1, 1, 1, 1]),  # it flaps: no loop closes so often
+        ([0.0, 0.1, 0.2, 0.3, 0.4], 1.0, [0, 0, 0, 0, 0]),  # slip between poses a second apart
+        ([0.0, 0.1, 0.1, 0.1, 0.1], 0.1, [0, 1, 1, 1, 1]),
+    ],
+)
+def test_a_jump_soon_after_another_or_no_larger_than_slip_is_no_revision(x_m, after_s, counted):
+    node, found = TfNode(), []
+    for shift_m in x_m:
+        node.publish(se3.from_xy_yaw(shift_m, 0.0, 0.0))
+        found.append(int(node.track(after_s)["revision"]))
     assert found == counted
 
 

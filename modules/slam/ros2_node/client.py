@@ -34,8 +34,9 @@ _TYPES = {
 }
 _KEPT = 1000  # stored observations without a pose
 # A larger move of the pose from one observation to the next is a loop closure. Less is within the
-# bounds of the bus's gate: 0.09 m and 3 degrees.
+# bounds of the bus's gate: 0.09 m and 3 degrees. In a second wheels may slip by as much again.
 _JUMP_M, _JUMP_RAD = 0.08, np.radians(2.0)
+_JUMP_NS = 5_000_000_000  # the gate's longer horizon: it judges what jumps more often
 
 
 class NodeClient:
@@ -51,6 +52,8 @@ class NodeClient:
         self._T_local_world: Transform | None = None
         self._given_ns: int | None = None  # stamp of the newest returned pose
         self._T_map_odom: Transform | None = None  # the last that was used
+        self._used_ns = 0  # when
+        self._jumped_ns: int | None = None  # when the pose jumped last
         self._revision = 0
 
     def activate(self, rig: Fields) -> None:
@@ -98,7 +101,7 @@ class NodeClient:
             T_map_odom = self._heard.T_map_odom(self._settings["tf_age_max_s"])
             if T_map_odom is None or T_odom_base is None:
                 return poses([], [])
-            self._note_jump(T_map_odom, T_odom_base)
+            self._note_jump(stamp_ns, T_map_odom, T_odom_base)
             said = {stamp_ns: (T_map_odom @ T_odom_base, 0.0)}
         else:
             said = self._heard.wait(stamp_ns, self._settings["answer_s"])
@@ -135,13 +138,20 @@ class NodeClient:
         status = np.array(statuses, np.int64)
         return {**poses(stamps_ns, found), "status": status, "revision": self._revision}
 
-    def _note_jump(self, T_map_odom: Transform, T_odom_base: Transform) -> None:
-        """Count a revision where map -> odom moved the robot's pose by more than a jump."""
+    def _note_jump(self, stamp_ns: int, T_map_odom: Transform, T_odom_base: Transform) -> None:
+        """Count a revision where map -> odom made the robot's pose jump, for the first time in 5 s.
+
+        If poses that flap were revisions, the gate would never find that they are wrong.
+        """
         T_map_odom_old, self._T_map_odom = self._T_map_odom, T_map_odom
+        used_ns, self._used_ns = self._used_ns, stamp_ns
         if T_map_odom_old is None or not self._settings["closes_loops"]:
             return
         T_old_new = se3.inverse(T_map_odom_old @ T_odom_base) @ T_map_odom @ T_odom_base
-        self._revision += not se3.is_within(T_old_new, _JUMP_M, _JUMP_RAD)
+        slipped = 1.0 + (stamp_ns - used_ns) * 1e-9
+        if not se3.is_within(T_old_new, slipped * _JUMP_M, slipped * _JUMP_RAD):
+            jumped_ns, self._jumped_ns = self._jumped_ns, stamp_ns
+            self._revision += jumped_ns is None or stamp_ns - jumped_ns >= _JUMP_NS
 
     def _since_first(self, stamp_ns: int) -> Transform:
         """Return the motion by odometry since the first observation, identity without odometry."""
