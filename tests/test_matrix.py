@@ -158,7 +158,7 @@ def test_every_strategy_is_run_with_every_seed_and_lies_in_the_table(tmp_path):
     assert alone.overrides == ("story=tour", "seed=1", "policy.gate=null", table)
     assert [row[1] for row in verdict.table.rows] == ["a alone", "b alone", "rewind", "oracle"]
     assert verdict.table.rows[2][3] == "100.0 ± 0.0"
-    assert verdict.table.rows[1][2:4] == ("66.7 ± 33.3", "33.3 ± 16.7")
+    assert verdict.table.rows[1][2:4] == ("66.7 ± 47.1", "33.3 ± 23.6")  # sample deviations
     assert len((tmp_path / "cells.csv").read_text().splitlines()) == 9
     assert (tmp_path / "paths.png").stat().st_size > 5000
 

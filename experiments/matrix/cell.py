@@ -110,8 +110,11 @@ def mean(cells: Sequence[Cell]) -> list[Cell]:
 
 
 def deviation(cells: Sequence[Cell]) -> list[Cell]:
-    """Return the standard deviations over seeds, one per story and strategy (0 of one seed)."""
-    return [_over(group, np.std) for group in _groups(cells)]
+    """Return the sample standard deviations over seeds, one per story and strategy.
+
+    That of a single seed is 0.
+    """
+    return [_over(group, _sample_deviation) for group in _groups(cells)]
 
 
 def rows_of(cells: Iterable[Cell]) -> Iterator[list[str | float | None]]:
@@ -135,6 +138,10 @@ def _over(group: Sequence[Cell], reduce: Callable[[list[float]], Any]) -> Cell:
         name: float(reduce([getattr(one, name) for one in group])) for name in numbers
     }
     return replace(group[0], **values, seed=None)
+
+
+def _sample_deviation(values: Sequence[float]) -> float:
+    return float(np.std(values, ddof=1)) if len(values) > 1 else 0.0
 
 
 def _number(value: float | None) -> float:
