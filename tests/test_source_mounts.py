@@ -79,6 +79,28 @@ def test_frame_of_odometry_that_no_transform_places_is_named(
 
 
 @pytest.mark.parametrize(
+    ("child", "given", "is_odd"),
+    [
+        ("vicon", None, True),
+        ("vicon", "base", False),
+        ("laser", None, False),
+        ("husky/base_link", None, False),
+        ("", None, False),
+    ],
+)
+def test_body_of_the_truth_that_no_transform_places_is_named(
+    tmp_path: Path, child: str, given: str | None, is_odd: bool
+) -> None:
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        tree = [recorder.transform("base_link", "laser", 0.5)]
+        recorder.add("/tf_static", 0, recorder.new("tf2_msgs/msg/TFMessage", transforms=tree))
+        recorder.scan("/scan", STAMP_NS, [1.0, 2.0])
+        recorder.add("/ground_truth", STAMP_NS, odometry(recorder, STAMP_NS, np.eye(4), child))
+    survey = make_source("mcap", tmp_path / "a.mcap", ground_truth_frame=given).survey()
+    assert ["frame 'vicon'" in one for one in survey.odd] == [True] * is_odd
+
+
+@pytest.mark.parametrize(
     ("topic", "parent", "laser"),
     [
         ("/robot1/tf_static", "base_link", "laser"),

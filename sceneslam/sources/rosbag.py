@@ -25,7 +25,7 @@ from sceneslam.sources.bag.rig import (
 )
 from sceneslam.sources.bag.synchronise import Sample, SynchronisedSamples, Synchroniser
 from sceneslam.sources.bag.topics import choose_topics, describe
-from sceneslam.sources.bag.truth import BASE, CAMERA, read_truth
+from sceneslam.sources.bag.truth import BASE, CAMERA, read_truth, unplaced_body
 from sceneslam.sources.faults import FaultLog, at_stamp
 from sceneslam.sources.intrinsics import checked_above_zero, given_intrinsics, given_range_m
 from sceneslam.sources.prefetch import prefetched
@@ -142,7 +142,7 @@ class RosBag:
             sync_tolerance_s=self._sync_tolerance_s,
             mounts=self._mounts,
             unplaced=self._unplaced(),
-            odd=list(unregistered(self._recording, self._topics, self._frames)),
+            odd=list(self._assumed()),
         )
 
     def ground_truth(self) -> GroundTruth | None:
@@ -153,6 +153,12 @@ class RosBag:
         """Return the frames of sensors without a pose; without transforms, one may be the base."""
         found = unplaced(self._recording, self._topics, self._frames)
         return [] if self._frames.is_empty and len(found) == 1 else found
+
+    def _assumed(self) -> Iterator[str]:
+        """Yield sentences on what is assumed of depth and ground truth."""
+        yield from unregistered(self._recording, self._topics, self._frames)
+        if self._truth_frame is None:
+            yield from unplaced_body(self._recording, self._topics, self._frames)
 
     def _jobs(self) -> Iterator[Callable[[], Decoded]]:
         """Yield one decoding job per observation."""

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
 from sceneslam.ros import decode
-from sceneslam.sources.bag.frames import FrameTree
+from sceneslam.sources.bag.frames import FrameTree, has_base_name
 from sceneslam.sources.bag.recording import Recording
 from sceneslam.sources.bag.topics import BagTopics, first
 from sceneslam.types import se3
@@ -39,12 +40,23 @@ def read_truth(
     return GroundTruth(trajectory=trajectory, scenes=scenes)
 
 
+def unplaced_body(recording: Recording, topics: BagTopics, frames: FrameTree) -> Iterator[str]:
+    """Yield a sentence if the recorded poses are of a frame that no transform places."""
+    child = _child(recording, topics.ground_truth) if topics.ground_truth else ""
+    is_placed = frames.is_base(child) or has_base_name(child) or frames.T_base(child) is not None
+    if child and not is_placed:
+        yield (
+            f"{topics.ground_truth}: no transform connects frame {child!r} with the robot's base "
+            "(source.base_frame): its poses are taken for those of base; "
+            "source.ground_truth_frame says whose they are"
+        )
+
+
 def _tracked(
     recording: Recording, topic: str, frames: FrameTree, rig: Rig, truth_frame: str | None
 ) -> Transform:
     """Return T_base_tracked (4, 4) [m], where `tracked` is the frame of the recorded poses."""
-    message = first(recording, topic)
-    child = "" if message is None else decode.child_frame_id(message)
+    child = _child(recording, topic)
     T_base_child = frames.T_base(child) if child else None
     if truth_frame is None and T_base_child is not None:
         return T_base_child
@@ -52,6 +64,12 @@ def _tracked(
         truth_frame is None and not child and frames.base is None and _is_pose(recording, topic)
     )
     return rig.camera.T_base_cam if is_camera and rig.camera else se3.identity()
+
+
+def _child(recording: Recording, topic: str) -> str:
+    """Return the frame whose poses a topic holds, "" if it is not named."""
+    message = first(recording, topic)
+    return "" if message is None else decode.child_frame_id(message)
 
 
 def _is_pose(recording: Recording, topic: str) -> bool:
