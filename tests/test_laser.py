@@ -191,6 +191,20 @@ def test_the_motion_within_a_lidars_sweep_is_undone(late_s):
     assert off_rad[14:].max() < 0.01
 
 
+def test_a_sweep_is_undone_by_the_velocities_that_are_known():
+    """That of the cloud before counts as much; at first, and where it is lost, one is unknown."""
+    module = active(Rig(sensors=frozenset({Sensor.POINTS}), lidar=Lidar()))
+    inertia, points = module._front_end.motion.inertia, np.ones((1, 3), np.float32)
+    cloud = Observation(stamp_ns=0, points_lidar=points, point_times_s=np.array([0.1]))
+    shifts_m = []
+    for speed_m_s in (None, 2.0, 1.0, None, None):
+        inertia.reset()
+        if speed_m_s is not None:
+            inertia.velocity, inertia.is_known = np.array([speed_m_s, 0, 0, 0, 0, 0]), True
+        shifts_m.append(float(module._points_lidar(cloud)[0, 0] - 1.0))
+    assert shifts_m == pytest.approx([0.0, 0.2, 0.15, 0.1, 0.0], abs=1e-6)
+
+
 def test_observations_between_scans_are_predicted():
     path = loop_path(300)
     observations = drive(room(), path, odometry=path, rng=np.random.default_rng(6))

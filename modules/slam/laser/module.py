@@ -67,7 +67,7 @@ class LaserSlam(LocalModule):
     _front_end: FrontEnd | None = field(default=None, init=False)
     _T_base_laser: se3.Transform = field(default_factory=se3.identity, init=False)
     _T_base_lidar: se3.Transform = field(default_factory=se3.identity, init=False)
-    _velocity: NDArray[np.float64] = field(default_factory=lambda: np.zeros(6), init=False)
+    _velocity: NDArray[np.float64] | None = field(default=None, init=False)  # at the last cloud
 
     def __post_init__(self) -> None:
         """Check the settings."""
@@ -100,7 +100,7 @@ class LaserSlam(LocalModule):
             self._T_base_laser = self._scanner.T_base_laser
         else:
             self._T_base_laser = se3.identity() if rig.laser is None else rig.laser.T_base_laser
-        self._front_end, self._velocity = self._make_front_end(rig), np.zeros(6)
+        self._front_end, self._velocity = self._make_front_end(rig), None
 
     def track(self, observation: Observation) -> Tracking:
         """Return T_local_base at the observation."""
@@ -139,8 +139,11 @@ class LaserSlam(LocalModule):
         if observation.point_times_s is None or not self.deskew:
             return observation.points_lidar
         # Poses say what the velocity is, and depend on it here: of one step alone, it would swing.
-        before, self._velocity = self._velocity, self._front_end.motion.inertia.velocity
-        return deskewed(observation, self._T_base_lidar, 0.5 * (before + self._velocity))
+        before, inertia = self._velocity, self._front_end.motion.inertia
+        self._velocity = inertia.velocity if inertia.is_known else None
+        known = [velocity for velocity in (before, self._velocity) if velocity is not None]
+        twist_s = np.mean(known, axis=0) if known else np.zeros(6)
+        return deskewed(observation, self._T_base_lidar, twist_s)
 
     def _make_scanner(self, rig: Rig) -> DepthScanner | LidarScanner | None:
         if Sensor.SCAN in rig.sensors:
