@@ -23,8 +23,9 @@ class Pipeline:
     """Matches answers with observations; odometry extends the newest pose until the next one.
 
     Without odometry the pose is extended at constant velocity. In both cases it is DEGRADED, or
-    LOST when the newest answer is older than `late_max_s`. Its covariance grows by the motion's: by
-    the `wheels`, None: the usual ones, or by how fast a robot changes its velocity.
+    LOST when the newest answer is older than `late_max_s`. A covariance, where the answer has one,
+    grows by the motion's: by the `wheels`, None: the usual ones, or by how fast a robot changes its
+    velocity.
     """
 
     def __init__(self, late_max_s: float, wheels: Wheels | None = None) -> None:
