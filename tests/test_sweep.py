@@ -210,6 +210,22 @@ def test_job_without_any_pose_is_final(tmp_path):
     assert len(errors) == 1 and status.is_final(tmp_path)
 
 
+def test_job_that_a_stop_keeps_from_beginning_has_its_earlier_status(tmp_path, monkeypatch):
+    def stop(_, orders):
+        orders[0].stop.touch()
+        for order in orders:
+            run_job(order)
+
+    monkeypatch.setattr(Basic, "run", stop)
+    folders = ended(tmp_path, State.WAITING, State.INCOMPLETE, State.RUNNING)
+    lacking(folders[1], error="the map could not all be saved: no space left")
+    before = Status.read(folders[1])
+    assert not run_sweep(tmp_path, folders, {"backend": "basic"}, tmp_path)
+    assert Status.read(folders[1]) == before
+    stopped = [Status.read(folder).state for folder in (folders[0], folders[2])]
+    assert stopped == [State.STOPPED] * 2
+
+
 @pytest.mark.parametrize("how", ["command", "resume"])
 def test_job_of_a_damaged_recording_is_run_again_once_it_is_repaired(folder, how):
     recording = (folder / "room.mcap").resolve().read_bytes()

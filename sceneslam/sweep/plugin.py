@@ -152,16 +152,22 @@ def _maps(config: DictConfig) -> dict[str, Any]:
 
 
 def _prepare(folder: Path, config: DictConfig) -> None:
-    """Write a job's files, unless the same job is final in its folder."""
+    """Write a job's files, unless the same job is final in its folder.
+
+    The same job keeps its status: it has results, until it runs again.
+    """
     digest = hashlib.sha256(OmegaConf.to_yaml(without_hydra(config)).encode()).hexdigest()
     before = Status.read(folder)
-    if before is not None and before.is_final(folder) and before.config_sha256 == digest:
+    if before is not None and before.config_sha256 != digest:
+        before = None  # of another job
+    if before is not None and before.is_final(folder):
         return
     with closing(RunFolder.claim(folder, key="hydra.sweep.subdir")):
         with (folder / COMPOSED).open("wb") as file:
             pickle.dump(config, file)
-        overrides = [str(word) for word in config.hydra.overrides.task]
-        Status(state=State.WAITING, config_sha256=digest, overrides=overrides).write(folder)
+        if before is None:
+            overrides = [str(word) for word in config.hydra.overrides.task]
+            Status(state=State.WAITING, config_sha256=digest, overrides=overrides).write(folder)
 
 
 def _returned(folder: Path, config: DictConfig) -> JobReturn:

@@ -32,7 +32,7 @@ def run_sweep(
     """Run the jobs that are not final; return whether all are complete. Writes the table.
 
     A job that only lacks poses is final. Other incomplete ones, such as one of damaged input or of
-    a full disk, are run again.
+    a full disk, are run again; one that a stop keeps from beginning has its earlier results.
 
     `launcher` has the name of a backend, in `backend`, and its settings; `began_in` is the base
     folder of relative paths.
@@ -46,9 +46,10 @@ def run_sweep(
         file.write(json.dumps(kept, indent=2) + "\n")
     stop = own / "stop"
     stop.unlink(missing_ok=True)
-    missing = [folder for folder in folders if not _status(folder).is_final(folder)]
+    before = {folder: _status(folder) for folder in folders}
+    missing = [folder for folder in folders if not before[folder].is_final(folder)]
     for folder in missing:
-        _status(folder).now(State.WAITING, wall_s=None).write(folder)
+        before[folder].now(State.WAITING, wall_s=None, pid=None).write(folder)
     if missing:
         code = keep_code(own / "code")
         orders = [
@@ -58,6 +59,9 @@ def run_sweep(
             backend.run(orders)
     for folder in missing:
         settle(folder, State.STOPPED, "never began")
+        now = _status(folder)
+        if now.state is State.STOPPED and now.pid is None and before[folder].is_settled:
+            before[folder].write(folder)
     _tell(sweep, folders, skipped=len(folders) - len(missing))
     return all(_status(folder).state is State.DONE for folder in folders)
 
