@@ -1,6 +1,7 @@
 """One map of all modules and runs: places recognized, and loops closed."""
 
 import threading
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -29,8 +30,10 @@ from sceneslam.testing.floor_plans import (
     twins,
 )
 from sceneslam.types import planar
+from sceneslam.types.maps import PoseGraphLayer
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Camera, Rig, Sensor
+from sceneslam.types.trajectory import Trajectory
 
 
 def world(walls, seed=0):
@@ -155,6 +158,28 @@ def test_loops_between_modules_take_out_what_odometry_drifts():
     assert len(drive.of_kind("loop")) >= 3
     before, after = drive.drifted_m(true, map_of(true)), drive.errors_m(true, map_of(true))
     assert rms(after) < rms(before) / 3
+    off_m = drive.loops_off_m(true)
+    assert len(off_m) >= 3 and max(off_m) < 0.1
+
+
+def test_a_loop_is_judged_by_what_it_measured_not_by_where_the_run_lies():
+    poses, stamps_ns = transforms([[0, 0, 0], [1, 0, 1.5], [1, 2, 3]]), np.arange(3) * 10
+    measured = planar.to_transform(np.array([1.0, -1.0, 3.0]))
+    graph = PoseGraphLayer(
+        stamps_ns=stamps_ns[[0, 2]],
+        T_world_base=poses[[0, 2]],
+        edges=np.array([[0, 1], [0, 1]]),
+        T_from_to=np.stack([np.eye(4), measured]),
+        information=np.tile(np.eye(6), (2, 1, 1)),
+        is_loop=np.array([False, True]),
+    )
+    trajectory = Trajectory(stamps_ns=stamps_ns, T_world_base=poses)
+    atlas = SimpleNamespace(
+        trajectory=trajectory, fuse_maps=lambda: SimpleNamespace(pose_graph=graph)
+    )
+    events = [{"event": "loop", "to_ns": 0, "stamp_ns": 20}]
+    off_m = Drive(atlas, events=events).loops_off_m(planar.from_transforms(poses))
+    assert off_m == pytest.approx([3.0])
 
 
 def rms(errors_m):

@@ -92,16 +92,20 @@ class Drive:
         return _apart_m(np.array(self.reckoned), true, T_map_world)
 
     def loops_off_m(self, true: NDArray[np.float64]) -> list[float]:
-        """Return the error of the motion between the ends of every loop, of true poses (N, 3)."""
-        found = self.atlas.trajectory
-        T_map_base = [planar.from_transform(T) for T in found.T_world_base]
-        off_m = []
-        for loop in self.of_kind("loop"):
-            first, second = np.searchsorted(found.stamps_ns, [loop["to_ns"], loop["stamp_ns"]])
-            moved = planar.between(T_map_base[first], T_map_base[second])
-            due = planar.between(true[first], true[second])
-            off_m.append(float(np.linalg.norm((moved - due)[:2])))
-        return off_m
+        """Return how far off every loop is that was accepted at the end, of true poses (N, 3).
+
+        That is the error of the motion that it measured, wherever the run lies.
+        """
+        graph = self.atlas.fuse_maps().pose_graph
+        if graph is None:
+            return []
+        T_world_node = true[np.searchsorted(self.atlas.trajectory.stamps_ns, graph.stamps_ns)]
+        ends, T_from_to = graph.edges[graph.is_loop], graph.T_from_to[graph.is_loop]
+        due = [planar.between(*T_world_node[pair]) for pair in ends]
+        return [
+            float(np.linalg.norm(T[:2, 3] - motion[:2]))
+            for T, motion in zip(T_from_to, due, strict=True)
+        ]
 
     def of_kind(self, event: str) -> list[dict[str, Any]]:
         """Return the events of one kind."""
