@@ -448,6 +448,10 @@ class TrajectoryLog(Protocol):
     Poses and transforms are (4, 4) [m], covariances (6, 6) or None, as for the atlas.
     """
 
+    def add_observation(self, stamp_ns: int) -> None:
+        """Record that an observation was processed, and its pose reported as it is now."""
+        ...
+
     def add_session(self, module: str, T_map_local: Transform) -> None:
         """Record that a session of a module begins."""
         ...

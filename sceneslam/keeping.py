@@ -35,9 +35,8 @@ class Keeping:
         self._syncing = Syncing(self._journal.sync, self.events.sync)
         parts.atlas.keep_journal(self._journal)
 
-    def keep(self, stamp_ns: int) -> None:
+    def keep(self) -> None:
         """Flush all data of an observation."""
-        self._journal.add_observation(stamp_ns)
         self._journal.flush()
         self.events.flush()
 

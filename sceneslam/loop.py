@@ -283,7 +283,7 @@ class RunLoop:
         self._moments.look(observation, events)
         module = self._parts.modules.get(self._bus.active)
         self._tally.add(observation, () if module is None else module.requires)
-        self._keeping.keep(observation.stamp_ns)
+        self._keeping.keep()
         if not self._keeping.has_room(len(self._observed_ns)):
             self._sinks.drop_files(OSError(errno.ENOSPC, "what is left is for the results"))
         watch.lap("files")

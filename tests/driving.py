@@ -54,7 +54,9 @@ def drive(modules, *, steps=100, scene_at=lambda i: "Bright", table=TABLE, **opt
     for index in range(steps):
         if bus.state == "terminate":
             break
-        bus.step(feed(index))
+        observed = feed(index)
+        bus.step(observed)
+        atlas.observe(observed, bus.up_base)
     bus.close(index * PERIOD_NS)
     return bus, atlas, log, detector
 

@@ -188,6 +188,7 @@ def test_a_session_lies_in_the_map_as_the_middle_one_of_its_poses_is_corrected()
         atlas.begin_session("ab"[session], se3.identity())
         for index in range(4):
             atlas.add(10 * session + index, se3.from_xy_yaw(index, 0, 0), "ab"[session])
+            atlas.report(10 * session + index)
     shifts = [se3.from_xy_yaw(0.0, 0.1 * index, 0.0) for index in range(4)]
     atlas._correction = Correction(stamps_ns=np.arange(10, 14), T_new_old=np.stack(shifts))
     assert [one.T_map_local[1, 3] for one in atlas.sessions] == pytest.approx([0.0, 0.2])

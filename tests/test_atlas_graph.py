@@ -315,6 +315,7 @@ def test_the_first_pose_of_a_stamp_is_what_was_reported_online():
     atlas = Atlas(voxel_m=0.05)
     for stamp_ns, x_m in ((1, 0.0), (3, 1.0), (2, 5.0), (3, 6.0), (4, 2.0)):
         atlas.add(stamp_ns, at(x_m), "a")
+        atlas.report(stamp_ns)
     for found in (atlas.online, atlas.trajectory):
         assert found.stamps_ns.tolist() == [1, 3, 4]
         assert found.positions_m[:, 0].tolist() == [0.0, 1.0, 2.0]

@@ -190,15 +190,15 @@ def told_atlas(journal, seed):
             known[::3] = np.nan
             covariances = known if draw.integers(2) else None
             atlas.close_session(session, None, replace(revised, covariances=covariances))
-        if kind == 4:
-            nodes_ns = np.unique(draw.integers(0, stamp_ns, size=5))
-            moved = np.array([se3.exp(draw.normal(size=6)) for _ in nodes_ns])
-            atlas.correct(Correction(stamps_ns=nodes_ns, T_new_old=moved))
         known = draw.normal(size=(6, 6))
         covariance = known @ known.T if kind > 5 else None
         atlas.add_local(stamp_ns, se3.exp(draw.normal(size=6)))
         atlas.add(stamp_ns, se3.exp(draw.normal(size=6)), "" if kind == 3 else "möd", covariance)
-        journal.add_observation(stamp_ns)
+        if kind == 4:
+            nodes_ns = np.unique(draw.integers(0, stamp_ns, size=5))
+            moved = np.array([se3.exp(draw.normal(size=6)) for _ in nodes_ns])
+            atlas.correct(Correction(stamps_ns=nodes_ns, T_new_old=moved))
+        atlas.report(stamp_ns)
         journal.flush()
     return atlas
 
@@ -232,6 +232,7 @@ def test_a_cut_off_run_is_corrected_once(tmp_path):
     for stamp_ns in range(2):
         atlas.add_local(stamp_ns, told[stamp_ns])
         atlas.add(stamp_ns, told[stamp_ns], "a")
+        atlas.report(stamp_ns)
     atlas.close_session(
         first, MapLayers(), Trajectory(stamps_ns=np.arange(2), T_world_base=revised)
     )
@@ -239,6 +240,7 @@ def test_a_cut_off_run_is_corrected_once(tmp_path):
     atlas.correct(Correction(stamps_ns=np.arange(2), T_new_old=revised @ se3.inverse(told)))
     atlas.add_local(2, se3.identity())
     atlas.add(2, told[1], "b")
+    atlas.report(2)
     for stop in ("killed", "mapped"):
         if stop != "killed":  # nothing is left to be corrected
             atlas.end_with(Correction.none())

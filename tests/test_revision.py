@@ -26,6 +26,7 @@ def add_session(atlas, module, T_map_local, stamps_ns, poses):
     for stamp_ns, T_local_base in zip(stamps_ns, poses, strict=True):
         atlas.add_local(stamp_ns, T_local_base)
         atlas.add(stamp_ns, T_map_local @ T_local_base, module)
+        atlas.report(stamp_ns)
     return session
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from bisect import bisect_right
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 
@@ -97,14 +98,27 @@ class Atlas:
 
     def observe(self, observation: Observation, up_base: Vector | None) -> None:
         """Add an observation whose pose was added, and the upward direction (3,) in base."""
-        if self._mapper is None or self._note is None:
-            return
+        if self._mapper is not None:
+            self._look(self._mapper, observation, up_base)
+        self.report(observation.stamp_ns)
+
+    def report(self, stamp_ns: int) -> None:
+        """Add all newer poses to `online` as they are now; an observation was processed."""
+        if self._journal is not None:
+            self._journal.add_observation(stamp_ns)
+        path, online = self._path, self._online
+        first = bisect_right(path.stamps_ns, online.stamps_ns[-1]) if online.stamps_ns else 0
+        for row in range(first, len(path.stamps_ns)):
+            online.add(path.stamps_ns[row], self._in_map(path.poses[row]))
+
+    def _look(self, mapper: Mapper, observation: Observation, up_base: Vector | None) -> None:
+        """Add an observation to the submaps, and take the correction that follows."""
         try:
-            self._mapper.observe(observation, up_base)
-            correction = self._mapper.take_correction()
+            mapper.observe(observation, up_base)
+            correction = mapper.take_correction()
             if correction is not None:
                 self.correct(correction.changes(self._correction))
-            self._lasting.keep(observation.stamp_ns, self._mapper)
+            self._lasting.keep(observation.stamp_ns, mapper)
         except Exception as error:  # poses continue without a map
             self._give_up(error)
 
@@ -191,7 +205,6 @@ class Atlas:
         if self._journal is not None:
             self._journal.add_pose(stamp_ns, T_map_base, module, covariance, map_covariance)
         session = len(self._sessions) - 1
-        self._online.add(stamp_ns, self._in_map(T_map_base))
         self._path.add(stamp_ns, T_map_base, module, session, covariance, map_covariance)
 
     def rewind(self, stamp_ns: int) -> None:

@@ -43,16 +43,15 @@ class OpenSession:
 
 @dataclass(slots=True)
 class PoseLog:
-    """Poses ordered by stamp, as they were reported."""
+    """Poses by rising stamp, as they were reported."""
 
     stamps_ns: array[int] = field(default_factory=lambda: array("q"))
     poses: Rows = field(default_factory=lambda: Rows(4, 4))
 
     def add(self, stamp_ns: int, T_map_base: Transform) -> None:
-        """Add a pose unless its stamp, or a later one, already has one."""
-        if not self.stamps_ns or stamp_ns > self.stamps_ns[-1]:
-            self.stamps_ns.append(stamp_ns)
-            self.poses.append(T_map_base)
+        """Add T_map_base (4, 4) [m]."""
+        self.stamps_ns.append(stamp_ns)
+        self.poses.append(T_map_base)
 
 
 @dataclass(slots=True)

@@ -98,6 +98,9 @@ class _Retold:
     def __init__(self, atlas: Atlas) -> None:
         self._atlas = atlas
 
+    def add_observation(self, stamp_ns: int) -> None:
+        self._atlas.report(stamp_ns)
+
     def add_session(self, module: str, T_map_local: Transform) -> None:
         self._atlas.begin_session(module, T_map_local)
 

@@ -6,7 +6,7 @@
 | kind | body |
 |---|---|
 | `H` | JSON: what the results need beside the configuration (`JournalHeader`) |
-| `O` | stamp [ns] of an observation |
+| `O` | stamp [ns] of an observation; its pose is reported as it is now |
 | `S` | T_map_local of a new session, key of its module |
 | `L` | stamp, T_local_base of the session |
 | `P` | stamp, T_map_base, two covariances (each a byte 1 and 21 numbers, or a byte 0), its module |
@@ -76,7 +76,7 @@ class Journal:
         return self._file.fault
 
     def add_observation(self, stamp_ns: int) -> None:
-        """Record that an observation was processed."""
+        """Record that an observation was processed, and its pose reported."""
         self._add(b"O", _STAMP.pack(stamp_ns))
 
     def add_session(self, module: str, T_map_local: Transform) -> None:
@@ -168,6 +168,7 @@ def read_journal(path: Path, log: TrajectoryLog) -> Kept:
                 head = JournalHeader(**json.loads(body))
             elif kind == b"O":
                 observed_ns.append(_number(body))
+                log.add_observation(observed_ns[-1])
             else:
                 _TELL[kind](log, body)
             read += _HEAD.size + len(body)
