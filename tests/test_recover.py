@@ -17,16 +17,17 @@ from sceneslam.app import run
 from sceneslam.atlas.atlas import Atlas
 from sceneslam.atlas.submaps.correction import Correction
 from sceneslam.recover.__main__ import main
-from sceneslam.recover.recover import _Retold
+from sceneslam.recover.recover import _reference, _Retold
 from sceneslam.storage.journal import MAGIC, Journal, JournalHeader, read_journal
 from sceneslam.types import se3
 from sceneslam.types.errors import InputError
 from sceneslam.types.files import AppendedFile
 from sceneslam.types.maps import MapLayers
+from sceneslam.types.rig import Wheels
 from sceneslam.types.trajectory import Trajectory
 
 RESULTS = ("trajectory.tum", "trajectory_online.tum", "metrics.json", "report.html")
-HEAD = JournalHeader(title="test", value_label="grey", has_odometry=True, began_in="/")
+HEAD = JournalHeader(title="test", value_label="grey", wheels=Wheels(axle_m=0.1), began_in="/")
 
 
 def started(settings, folder, fds=()):
@@ -84,6 +85,32 @@ def test_events_that_cannot_be_written_again_cost_no_pose(tmp_path, monkeypatch,
     assert main([str(folder)]) == 0
     assert "missing: a new events.jsonl: OSError: no space left" in capsys.readouterr().err
     assert len(Trajectory.read_tum(folder / "trajectory.tum")) == 81
+
+
+def test_only_a_run_that_asked_for_a_reference_is_compared_with_the_one_in_its_folder(tmp_path):
+    folder = killed(tmp_path, 20)
+    (folder / "reference").mkdir()
+    poses = Trajectory(stamps_ns=np.arange(2), T_world_base=np.tile(np.eye(4), (2, 1, 1)))
+    poses.write_tum(folder / "reference" / "trajectory.tum")
+    assert main([str(folder)]) == 0
+    assert "reference" not in json.loads((folder / "metrics.json").read_text())
+
+
+def test_reference_gets_the_stamps_of_the_observations(tmp_path):
+    class Received:
+        def logged_ns(self, stamps_ns):
+            return stamps_ns + np.array([5, 40, 10])  # not in their order
+
+    observed_ns = np.array([100, 120, 140])
+    T_map_base = np.stack([se3.from_xy_yaw(x, 0.0, 0.0) for x in range(3)])
+    source = Received()
+    written = Trajectory(stamps_ns=observed_ns, T_world_base=T_map_base)
+    (tmp_path / "reference").mkdir()
+    path = tmp_path / "reference" / "trajectory.tum"
+    written.stamped(source.logged_ns(observed_ns)).write_tum(path)
+    read = _reference(tmp_path, source, observed_ns)
+    assert read.stamps_ns.tolist() == [100, 120, 140]
+    np.testing.assert_allclose(read.positions_m[:, 0], [0.0, 1.0, 2.0])
 
 
 def test_a_run_at_its_end_has_no_journal_and_is_not_recovered(tmp_path, capsys):
@@ -217,7 +244,7 @@ def test_an_atlas_that_is_told_a_journal_is_the_one_it_was_kept_of(tmp_path, see
         np.testing.assert_array_equal(one.stamps_ns, two.stamps_ns)
         np.testing.assert_array_equal(one.T_world_base, two.T_world_base)
     assert atlas.pose_modules == again.pose_modules
-    np.testing.assert_allclose(atlas.covariances(True), again.covariances(True), rtol=1e-12)
+    np.testing.assert_allclose(atlas.covariances(Wheels()), again.covariances(True), rtol=1e-12)
 
 
 def test_a_cut_off_run_is_corrected_once(tmp_path):

@@ -25,6 +25,7 @@ from sceneslam.evaluation.metrics import Metrics
 from sceneslam.evaluation.settings import EvaluationSettings
 from sceneslam.interfaces import Source
 from sceneslam.results import Results
+from sceneslam.sources.changes.wrapped import logged_ns
 from sceneslam.storage.journal import JOURNAL, Kept, read_journal
 from sceneslam.types.errors import InputError, SceneSlamError, text_of
 from sceneslam.types.files import PART, owned, replacing
@@ -80,13 +81,8 @@ def recover(folder: Path) -> Recovered:
     )
     result = _result(atlas, kept, events, results.lose)
     results.save_trajectories(result)
-    reference = folder / "reference" / "trajectory.tum"
-    metrics = results.save_rest(
-        result,
-        truth,
-        reference=Trajectory.read_tum(reference) if reference.is_file() else None,
-        has_costs=False,
-    )
+    reference = _reference(folder, source, kept.observed_ns) if config.get("reference") else None
+    metrics = results.save_rest(result, truth, reference=reference, has_costs=False)
     if not results.unsaved:
         _tidy(folder)
     return Recovered(metrics=metrics, missing=tuple(missing), faults=tuple(results.unsaved))
@@ -178,6 +174,23 @@ def _source(
     return source, None
 
 
+def _reference(
+    folder: Path, source: Source | None, observed_ns: NDArray[np.int64]
+) -> Trajectory | None:
+    """Return the trajectory of the reference run, None where it has none.
+
+    Its file has the recording's own stamps; it gets those of the observations, as poses have.
+    """
+    path = folder / "reference" / "trajectory.tum"
+    if not path.is_file():
+        return None
+    found = Trajectory.read_tum(path)
+    logged = logged_ns(source, observed_ns).tolist()
+    measured_ns = dict(zip(logged, observed_ns.tolist(), strict=True))
+    stamps_ns = [measured_ns.get(stamp_ns, stamp_ns) for stamp_ns in found.stamps_ns.tolist()]
+    return found.stamped(np.array(stamps_ns, np.int64))
+
+
 def _sentence(atlas: Atlas, kept: Kept) -> str:
     return (
         f"the run was cut off after {len(kept.observed_ns)} observations; these results, of "
@@ -193,7 +206,7 @@ def _result(
         observed_ns=kept.observed_ns,
         trajectory=atlas.trajectory,
         online=atlas.online,
-        covariances=covariances_of(atlas, fault, has_odometry=kept.head.has_odometry),
+        covariances=covariances_of(atlas, fault, wheels=kept.head.wheels),
         modules=atlas.pose_modules,
         sessions=atlas.sessions,
         map=fused_map_of(atlas, fault),
