@@ -24,7 +24,7 @@ from sceneslam.config.build import opened_source
 from sceneslam.config.check import check_given, check_maps_apart, check_no_reference, first_line
 from sceneslam.config.component import ComponentBuilder
 from sceneslam.config.overlay import command_of, comment_of
-from sceneslam.config.provenance import provenance, save_config
+from sceneslam.config.provenance import files_written, provenance, save_config
 from sceneslam.config.resolve import resolved
 from sceneslam.config.settings import DETECT_ONLY
 from sceneslam.config.words import check_trust
@@ -189,7 +189,8 @@ def _run_unless_finished(config: dict[str, Any], folder: Path, name: str) -> Non
     made_by = provenance(config)
     if _finished_by(folder) == made_by:
         return
-    (folder / _END).unlink(missing_ok=True)
+    for earlier in (folder / _END, *files_written(config)):
+        earlier.unlink(missing_ok=True)
     faults: tuple[str, ...] = ()
     is_final, is_stop_requested = True, False
     if config["run"]["mode"] == DETECT_ONLY:

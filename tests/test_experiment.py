@@ -319,6 +319,23 @@ def test_faults_of_runs_beside_each_other_strike_in_the_runs_alone(tmp_path):
     assert len(record.read_text().splitlines()) == seen  # each once, the first one too
 
 
+def test_a_trial_that_runs_begins_without_the_record_of_its_earlier_run(tmp_path):
+    record = tmp_path / "struck.jsonl"
+    target = "sceneslam.modules.slam.faulty.FaultyModule"
+    rates = {"rate_ratio": 1.0, "lasting_s": 0.5, "jump_m": 1.0, "seed": 0}
+    inner = {"_target_": "fakes.ExactModule"}
+    struck = {"_target_": target, "module": inner, "faults": ["nan"], "record": str(record)}
+    settings = config(run__report=False, slam__bright=struck | rates)
+    _run_unless_finished(settings, tmp_path, "trial")
+    struck_ns = [json.loads(line)["stamp_ns"] for line in record.read_text().splitlines()]
+    (tmp_path / "finished.json").unlink()
+    _run_unless_finished(settings, tmp_path, "trial")
+    again_ns = [json.loads(line)["stamp_ns"] for line in record.read_text().splitlines()]
+    assert again_ns == struck_ns and struck_ns
+    _run_unless_finished(settings, tmp_path, "trial")
+    assert len(record.read_text().splitlines()) == len(struck_ns)  # it is kept
+
+
 @pytest.mark.parametrize("read", [_prepare, lambda settings: _try_sources([settings])])
 def test_a_live_source_that_was_tried_before_the_trials_is_closed(monkeypatch, read):
     monkeypatch.setattr(LiveFeedSource, "is_open", True)

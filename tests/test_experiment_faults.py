@@ -15,6 +15,7 @@ from sceneslam.experiments.faults.torn import torn_files
 from sceneslam.experiments.faults.witness import TOLD
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.experiment import TrialResult
+from sceneslam.types.trajectory import Trajectory
 
 FAULTS = ["raise", "kill", "nan", "hang"]
 SETTINGS = {
@@ -96,6 +97,19 @@ def test_every_strike_in_the_record_is_judged(found):
     assert [strike.kind for strike in strikes] == [json.loads(line)["kind"] for line in lines]
     assert all(0 <= strike.recovery_s < 30.0 for strike in strikes)
     assert all(0 < strike.clock_s < 30.0 for strike in strikes)
+
+
+def test_a_finished_trial_that_is_kept_keeps_its_record(found):
+    verdict, folder = found
+
+    def keep(trials):
+        for trial in trials:
+            whole = Trajectory.read_tum(folder / "trajectory.tum")
+            parts = {"metrics": {}, "trajectory": whole, "online": whole, "faults": ()}
+            yield TrialResult(trial=trial, folder=folder, **parts)
+
+    kept = FaultsExperiment(runs=1, **{**SETTINGS, "cut_offs": {}}).run(keep, folder.parents[1])
+    assert kept.figures[0] == verdict.figures[0] and kept.figures[0].value > 0
 
 
 def test_poses_that_stay_wrong_are_no_recovery(found, tmp_path):

@@ -125,7 +125,6 @@ class FaultsExperiment:
         values: dict[str, object] = {}
         for place, key in enumerate(self._struck):
             record = folder / "runs" / name / _record(key)
-            record.unlink(missing_ok=True)
             seed = self._seed + index * len(self._struck) + place
             _put(values, key, {"seed": seed, "record": str(record)})
         return Trial(name=name, values=values)

@@ -99,6 +99,15 @@ def input_sha256(config: Mapping[str, Any]) -> str:
     return digest.hexdigest() if is_any else "none"
 
 
+def files_written(value: Any, key: str = "") -> Iterator[Path]:
+    """Yield the files that components of a configuration write beside a run's own."""
+    if isinstance(value, Mapping):
+        for name, inner in value.items():
+            yield from files_written(inner, str(name))
+    elif isinstance(value, str) and key in _WRITTEN:
+        yield given_path(value)
+
+
 def _input_pieces(config: Mapping[str, Any]) -> Iterator[bytes]:
     """Yield the names, sizes and contents of the files that a run reads."""
     for key in _READERS:
