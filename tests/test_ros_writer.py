@@ -19,7 +19,7 @@ from sceneslam.types.maps import GridLayer, PointLayer
 from sceneslam.types.observation import LaserScan, Observation
 from sceneslam.types.rig import Camera, Laser, Lidar, Rig, Sensor, optical_to_rep103
 from sceneslam.types.trajectory import Trajectory
-from sceneslam.types.truth import GroundTruth, SceneChange
+from sceneslam.types.truth import GroundTruth, SceneChange, placed_by_pose
 
 STEP_NS = 33_333_333
 T_BASE_CAM = se3.from_parts(optical_to_rep103()[:3, :3], np.array([0.1, 0.0, 0.3]))
@@ -242,6 +242,35 @@ def test_truth_that_is_longer_than_the_run_moves_neither_map_nor_path(tmp_path: 
     frames = [recording.decode(one) for one in recording.messages({names.TF_STATIC})]
     children = {each.child_frame_id for one in frames for each in one.transforms}
     assert names.GT not in children  # where the truth lies in the map is not known
+
+
+@pytest.mark.parametrize(("apart_ms", "is_known"), [(200, True), (2000, False)])
+def test_truth_between_whose_poses_the_run_begins_is_interpolated(apart_ms, is_known) -> None:
+    stamps_ns = STAMP_NS + np.array([0, apart_ms, 2 * apart_ms]) * 10**6
+    poses = np.stack([se3.from_xy_yaw(x_m, 0.0, 0.0) for x_m in (0.0, 1.0, 2.0)])
+    true = Trajectory(stamps_ns=stamps_ns, T_world_base=poses)
+    begin_ns = STAMP_NS + apart_ms * 3 * 10**6 // 2
+    T_map_gt = placed_by_pose(true, begin_ns, se3.from_xy_yaw(0.0, 4.0, 0.0))
+    assert (T_map_gt is not None) is is_known
+    if T_map_gt is not None:
+        np.testing.assert_allclose(T_map_gt[:2, 3], [-1.5, 4.0])
+    just_before = placed_by_pose(true, STAMP_NS - 40_000_000, np.eye(4))
+    np.testing.assert_allclose(just_before, np.eye(4))
+    assert placed_by_pose(true, STAMP_NS - 60_000_000, np.eye(4)) is None
+
+
+def test_truth_of_a_slow_sensor_has_its_frame(tmp_path: Path) -> None:
+    made = observations(5)
+    writer = ObservationWriter(tmp_path / "run.mcap", rig=RIG, image_format="jpeg")
+    writer.write_pose(made[0].stamp_ns, np.eye(4))
+    stamps_ns = made[0].stamp_ns + np.array([-100, 100]) * 10**6
+    true = Trajectory(stamps_ns=stamps_ns, T_world_base=np.stack([np.eye(4)] * 2))
+    writer.write_truth(GroundTruth(trajectory=true))
+    writer.close()
+    recording = open_recording(tmp_path / "run.mcap")
+    frames = [recording.decode(one) for one in recording.messages({names.TF_STATIC})]
+    children = {each.child_frame_id for one in frames for each in one.transforms}
+    assert names.GT in children
 
 
 def test_recordings_open_with_the_reference_reader(tmp_path: Path) -> None:

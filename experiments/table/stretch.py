@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.evaluation.accuracy import relative_errors
-from sceneslam.evaluation.association import TRUTH_GAP_S, covered, interpolated
+from sceneslam.evaluation.association import covered, interpolated
 from sceneslam.types.experiment import TrialResult
 from sceneslam.types.run import Event
 from sceneslam.types.trajectory import Trajectory
+from sceneslam.types.truth import TRUTH_GAP_S
 
 _STAMP_GAP_S = 0.005  # stamps are the recording's own
 

@@ -11,7 +11,6 @@ from sceneslam.types import se3
 from sceneslam.types.trajectory import Trajectory
 
 Indices = NDArray[np.int64]
-TRUTH_GAP_S = 0.5  # ground truth is not interpolated over more
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.evaluation.alignment import align
-from sceneslam.evaluation.association import TRUTH_GAP_S, covered, interpolated, select
+from sceneslam.evaluation.association import covered, interpolated, select
 from sceneslam.evaluation.path import driven_m
 from sceneslam.types import se3
 from sceneslam.types.trajectory import Trajectory
+from sceneslam.types.truth import TRUTH_GAP_S
 
 _POSE_GAP_NS = 10**9  # longest time that one pose counts
 

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.evaluation.association import TRUTH_GAP_S, covered, interpolated
+from sceneslam.evaluation.association import covered, interpolated
 from sceneslam.types import se3
 from sceneslam.types.run import Event, RunResult
 from sceneslam.types.se3 import Transform
-from sceneslam.types.truth import GroundTruth, SceneChange
+from sceneslam.types.truth import TRUTH_GAP_S, GroundTruth, SceneChange
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from sceneslam.config.build import make_source
 from sceneslam.config.check import first_line
 from sceneslam.config.component import ComponentBuilder
-from sceneslam.evaluation.association import TRUTH_GAP_S, covered, interpolated
+from sceneslam.evaluation.association import covered, interpolated
 from sceneslam.interfaces import Live, Source
 from sceneslam.types import se3
 from sceneslam.types.errors import InputError
@@ -25,6 +25,7 @@ from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Camera
 from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import Trajectory
+from sceneslam.types.truth import TRUTH_GAP_S
 
 Maps = tuple[NDArray[np.float32], NDArray[np.float32]]  # columns and rows
 

@@ -21,10 +21,9 @@ from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.run import RunResult
 from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import Trajectory
-from sceneslam.types.truth import GroundTruth
+from sceneslam.types.truth import GroundTruth, placed_by_pose
 
 _CHUNK_BYTES = 256 * 1024  # largest loss if the file is cut off
-_TRUTH_GAP_NS = 50_000_000  # between a pose and its true one, at most
 _DEPTH_UNITS_PER_M = 1000.0
 
 
@@ -120,7 +119,7 @@ class ObservationWriter:
     def write_truth(self, truth: GroundTruth) -> None:
         """Add all true poses (float64) and scene changes; at any time before `close`.
 
-        With results, frame `gt` is aligned with `map` at the first pose, if the truth begins by it.
+        With results, frame `gt` is aligned with `map` at the first pose, if the truth covers it.
         """
         last_ns = self._last_ns
         self._write_truth_frame(truth.trajectory)
@@ -160,14 +159,12 @@ class ObservationWriter:
             self._add(names.TF_STATIC, stamp_ns, data)
 
     def _write_truth_frame(self, trajectory: Trajectory) -> None:
-        if self._first_pose is None or not len(trajectory):
+        if self._first_pose is None:
             return
-        stamp_ns, T_map_base = self._first_pose
-        apart_ns = np.abs(trajectory.stamps_ns - stamp_ns)
-        nearest = int(apart_ns.argmin())
-        if apart_ns[nearest] > _TRUTH_GAP_NS:
+        T_map_gt = placed_by_pose(trajectory, *self._first_pose)
+        if T_map_gt is None:
             return
-        T_map_gt = T_map_base @ se3.inverse(trajectory.T_world_base[nearest])
+        stamp_ns, _ = self._first_pose
         data = self._encoder.transforms(stamp_ns, names.MAP, {names.GT: T_map_gt})
         self._add(names.TF_STATIC, stamp_ns, data)
 

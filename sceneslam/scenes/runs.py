@@ -12,12 +12,13 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from sceneslam.evaluation.association import TRUTH_GAP_S, covered, interpolated
+from sceneslam.evaluation.association import covered, interpolated
 from sceneslam.types import se3
 from sceneslam.types.errors import InputError
 from sceneslam.types.input_files import read_text
 from sceneslam.types.observation import TrackingStatus
 from sceneslam.types.trajectory import Trajectory
+from sceneslam.types.truth import TRUTH_GAP_S
 
 STEP_S = 0.1  # between the instants that are labelled
 _SPAN_S = 2.0  # motions are compared over the paper's confirmation window

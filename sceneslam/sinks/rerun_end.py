@@ -10,17 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.sinks import rerun_layout as at
-from sceneslam.types import se3
 from sceneslam.types.maps import GridLayer
 from sceneslam.types.run import RunResult
 from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import Trajectory
-from sceneslam.types.truth import GroundTruth
+from sceneslam.types.truth import GroundTruth, placed_by_pose
 
 if TYPE_CHECKING:
     import rerun as rr
 
-_TRUTH_GAP_NS = 50_000_000
+_TRUTH_GAP_NS = 50_000_000  # between a pose and its true one, for errors
 _OCCUPIED_LOG_ODDS = 0.85  # 0.7
 _POINTS_MAX = 200_000  # of one module
 Colors = Mapping[str, tuple[int, int, int]]
@@ -40,7 +39,7 @@ def write_end(
     """
     _write_map(recording, result, colors)
     _write_revised(recording, result, colors)
-    if truth is None or first is None or not len(truth.trajectory):
+    if truth is None or first is None:
         return
     placed = _placed(truth.trajectory, *first)
     if placed is not None:
@@ -86,11 +85,10 @@ def _write_revised(recording: rr.RecordingStream, result: RunResult, colors: Col
 
 
 def _placed(true: Trajectory, stamp_ns: int, T_map_base: Transform) -> Trajectory | None:
-    """Return the true trajectory in `map`, None if it has no pose at the stamp."""
-    at_first = int(np.argmin(np.abs(true.stamps_ns - stamp_ns)))
-    if abs(int(true.stamps_ns[at_first]) - stamp_ns) > _TRUTH_GAP_NS:
+    """Return the true trajectory in `map`, None if it does not cover the stamp."""
+    T_map_gt = placed_by_pose(true, stamp_ns, T_map_base)
+    if T_map_gt is None:
         return None
-    T_map_gt = T_map_base @ se3.inverse(true.T_world_base[at_first])
     return Trajectory(stamps_ns=true.stamps_ns, T_world_base=T_map_gt @ true.T_world_base)
 
 

@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.evaluation.association import TRUTH_GAP_S, covered, interpolated
+from sceneslam.evaluation.association import covered, interpolated
 from sceneslam.evaluation.figures import style as look
 from sceneslam.types import se3
 from sceneslam.types.trajectory import Trajectory
+from sceneslam.types.truth import TRUTH_GAP_S
 
 _MARGIN = 0.08  # of the true path's extent: paths beyond it are cut off
 _STYLES = ("-", "--", "-.")
