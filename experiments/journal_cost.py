@@ -23,7 +23,7 @@ _OBSERVATIONS = 20_000
 
 def main(folder: Path) -> None:
     """Print the table."""
-    head = JournalHeader(title="cost", value_label="", has_odometry=False, began_in="")
+    head = JournalHeader(title="cost", value_label="", wheels=None, began_in="")
     journal = Journal(folder / "journal.bin", head)
     log = EventLog(folder / "events.jsonl")
     syncing = Syncing(journal.sync, log.sync)

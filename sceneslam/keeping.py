@@ -11,7 +11,6 @@ from sceneslam.storage.journal import JOURNAL, Journal, JournalHeader
 from sceneslam.storage.reserve import Reserve
 from sceneslam.storage.syncing import Syncing
 from sceneslam.types.errors import ConfigError, text_of
-from sceneslam.types.rig import Sensor
 
 
 class Keeping:
@@ -22,7 +21,7 @@ class Keeping:
         head = JournalHeader(
             title=results.title,
             value_label=results.value_label,
-            has_odometry=Sensor.ODOMETRY in parts.rig.sensors,
+            wheels=parts.rig.odometry,
             began_in=str(Path.cwd()),
         )
         try:

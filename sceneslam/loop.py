@@ -36,7 +36,6 @@ from sceneslam.sources.survey.tally import Tally
 from sceneslam.storage.events import log_uncertainty
 from sceneslam.types.errors import InputError, text_of
 from sceneslam.types.observation import Observation
-from sceneslam.types.rig import Sensor
 from sceneslam.types.run import Event, RunResult, Timings
 from sceneslam.types.truth import GroundTruth
 
@@ -165,8 +164,8 @@ class RunLoop:
 
     def _add_covariances(self) -> None:
         """Compute the trajectory's covariances, and log those where sessions begin."""
-        atlas, has_odometry = self._parts.atlas, Sensor.ODOMETRY in self._parts.rig.sensors
-        self._covariances = covariances_of(atlas, self.faults.append, has_odometry=has_odometry)
+        atlas, wheels = self._parts.atlas, self._parts.rig.odometry
+        self._covariances = covariances_of(atlas, self.faults.append, wheels=wheels)
         if len(self._covariances):
             log_uncertainty(self._log, atlas.session_starts(), self._covariances)
 

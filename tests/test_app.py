@@ -254,7 +254,7 @@ def test_maps_that_cannot_be_fused_cost_the_map_alone(tmp_path, monkeypatch):
 
 
 def test_covariances_that_fail_cost_their_file_alone(tmp_path, monkeypatch):
-    def fail(atlas, has_odometry):
+    def fail(atlas, wheels):
         raise MemoryError("too large")
 
     monkeypatch.setattr("sceneslam.atlas.atlas.Atlas.covariances", fail)

@@ -20,10 +20,11 @@ from sceneslam.atlas.submaps import run_graph
 from sceneslam.atlas.submaps.graph import Solved, consistent, fits, on_floor, solve
 from sceneslam.atlas.submaps.path_drift import PathDrift
 from sceneslam.atlas.submaps.run_graph import RunGraph
-from sceneslam.atlas.uncertainty import WHEELS
+from sceneslam.atlas.uncertainty import of_wheels
 from sceneslam.graphs.edge import EdgeKind
 from sceneslam.types import planar, se3
 from sceneslam.types.maps import MapLayers, PoseGraphLayer
+from sceneslam.types.rig import Wheels
 from sceneslam.types.trajectory import Trajectory
 
 CLAIM = np.diag([4.0, 4.0, 4.0, 1.0, 1.0, 1.0]) * 1e-6
@@ -335,7 +336,7 @@ def path_of(T_map_base, sessions, is_bridged, reported):
 def test_a_bridged_pose_is_as_uncertain_as_the_last_measured_one_and_the_bridge():
     poses = [at(0.1 * index) for index in range(3)]
     path = path_of(poses, [0] * 3, [False, True, True], CLAIM)
-    found = covariances(path, loops=[], bridge=WHEELS)
+    found = covariances(path, loops=[], bridge=of_wheels(Wheels()))
     per_m, turn = 0.02 * 0.2, 0.01 * 0.2
     bridge = per_m**2 + (turn * 0.1) ** 2
     map_drift = CLAIM[0, 0] * 0.2 / 2.5
@@ -343,7 +344,7 @@ def test_a_bridged_pose_is_as_uncertain_as_the_last_measured_one_and_the_bridge(
     assert found[2, 0, 0] == pytest.approx(CLAIM[0, 0] + map_drift + bridge, rel=1e-3)
     assert found[2, 5, 5] == pytest.approx(CLAIM[5, 5] * (1.0 + 0.2 / 2.5) + turn**2, rel=1e-3)
     none = path_of(poses, [0] * 3, [True] * 3, np.full((6, 6), np.nan))
-    assert covariances(none, loops=[], bridge=WHEELS)[0, 0, 0] < 1e-9
+    assert covariances(none, loops=[], bridge=of_wheels(Wheels()))[0, 0, 0] < 1e-9
 
 
 def test_claims_are_scaled_by_the_drift_between_two_modules_beyond_their_noise():

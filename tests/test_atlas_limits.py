@@ -124,7 +124,7 @@ def test_a_covariance_that_says_unknown_costs_no_map(tmp_path, unknown):
         own.observe(Observation(stamp_ns=index * S), None)
     assert own.finish() == []
     assert len(own.fuse_maps().pose_graph.edges) == len(load_map_files(tmp_path / "map").edges) > 1
-    assert np.isfinite(own.covariances(has_odometry=False)).all()
+    assert np.isfinite(own.covariances(None)).all()
 
 
 @pytest.mark.parametrize("sigma_yaw", [1e-6, 0.1])

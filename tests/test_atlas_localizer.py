@@ -11,7 +11,7 @@ from sceneslam.atlas.places.localizer import LocalizationEvent, Look, MapLocaliz
 from sceneslam.atlas.places.plan_field import PlanField
 from sceneslam.atlas.places.recognition import Recognizer
 from sceneslam.types import planar, se3
-from sceneslam.types.rig import Camera
+from sceneslam.types.rig import Camera, Wheels
 from sceneslam.views.placed_views import Sighting
 
 
@@ -46,9 +46,9 @@ def in_map(T_map_run, at):
     return planar.from_transform(T_map_run @ planar.to_transform(np.array(at)))
 
 
-def located(scripted, at, run_at=(1.0, 2.0, 0.5)):
+def located(scripted, at, run_at=(1.0, 2.0, 0.5), wheels=None):
     """A localizer that found the robot at a pose of the map after a second."""
-    own, scripted.answer = MapLocalizer(corner_of()), quality(at=at)
+    own, scripted.answer = MapLocalizer(corner_of(), wheels=wheels), quality(at=at)
     assert own.compare([placed(0.0, *run_at)]) is LocalizationEvent.NOTHING
     assert own.compare([placed(1.0, *run_at)]) is LocalizationEvent.FOUND
     return own
@@ -155,9 +155,11 @@ def test_a_place_that_is_contradicted_three_times_in_a_row_is_withdrawn(monkeypa
     assert own.compare([placed(11, 0, 0, 0)]) is nothing  # a first search
 
 
-def test_a_robot_that_drove_a_round_may_be_off_by_what_drifts_on_all_of_it(monkeypatch):
+@pytest.mark.parametrize("worse", [1.0, 2.0])
+def test_a_robot_that_drove_a_round_may_be_off_by_what_drifts_on_all_of_it(monkeypatch, worse):
     scripted = Scripted(monkeypatch)
-    own = located(scripted, (4.0, 3.0, 1.0))
+    wheels = Wheels(drift_ratio=0.02 * worse, drift_rad_per_m=0.01 * worse)
+    own = located(scripted, (4.0, 3.0, 1.0), wheels=wheels)
     corners = [(2.0, 0.0, 0.5), (2.0, 2.0, 1.0), (0.0, 2.0, -0.5), (0.0, 0.0, 0.0)]
     looks = [
         placed(2.0 + index, *planar.compose(RUN_AT, np.array(corner)))
@@ -166,13 +168,13 @@ def test_a_robot_that_drove_a_round_may_be_off_by_what_drifts_on_all_of_it(monke
     scripted.answer = None
     for count in (1, 3, 4):  # one of them is seen with the next alone
         own.compare(looks[:count])
-    assert scripted.window.half_m == pytest.approx(0.15 + 0.06 * 8.0)
-    assert scripted.window.half_rad == pytest.approx(0.05 + 0.03 * 8.0 + 0.06 * 3.0)
+    assert scripted.window.half_m == pytest.approx(0.15 + worse * 0.06 * 8.0)
+    assert scripted.window.half_rad == pytest.approx(0.05 + worse * (0.03 * 8.0 + 0.06 * 3.0))
     scripted.answer = quality(at=(4.0, 3.0, 1.0))
     assert own.compare([placed(6.0)]) is LocalizationEvent.FIXED
     own.rewind(6 * S, lambda stamp_ns: looks[0].T_run_base)
     own.compare([placed(7.0)])
-    assert scripted.window.half_m == pytest.approx(0.15 + 0.06 * 2.0)  # from where the first is now
+    assert scripted.window.half_m == pytest.approx(0.15 + worse * 0.06 * 2.0)  # from the first
 
 
 @pytest.mark.parametrize(

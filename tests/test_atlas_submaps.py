@@ -7,13 +7,14 @@ import pytest
 
 from sceneslam.atlas.submaps.collector import Collector, Known
 from sceneslam.atlas.submaps.submap import KeyPose, OpenSubmap, make_submap, motion_covariance
-from sceneslam.atlas.uncertainty import GYRO, MAPPED, VELOCITY, WHEELS, drifted
+from sceneslam.atlas.uncertainty import MAPPED, VELOCITY, drifted, of_wheels
 from sceneslam.graphs.edge import EdgeKind
 from sceneslam.types import planar, se3
-from sceneslam.types.rig import Rig, Sensor
+from sceneslam.types.rig import Rig, Sensor, Wheels
 from sceneslam.types.run import BRIDGED
 
 S = 10**9
+WHEELS, POOR = of_wheels(Wheels()), Wheels(drift_ratio=0.1, drift_rad_per_m=0.03)
 RIG = Rig(sensors=frozenset({Sensor.ODOMETRY}))
 
 
@@ -222,20 +223,21 @@ def test_a_motion_that_is_bridged_for_more_than_half_is_a_bridge(bridged, kind):
 
 
 @pytest.mark.parametrize(
-    ("sensors", "drift"),
+    ("sensors", "wheels", "drift"),
     [
-        ({Sensor.ODOMETRY}, WHEELS),
-        ({Sensor.ODOMETRY, Sensor.GYRO}, GYRO),
-        ({Sensor.GYRO}, VELOCITY),
-        (set(), VELOCITY),
+        ({Sensor.ODOMETRY}, Wheels(), WHEELS),
+        ({Sensor.ODOMETRY}, POOR, of_wheels(POOR)),
+        ({Sensor.ODOMETRY, Sensor.GYRO}, POOR, of_wheels(POOR, has_gyro=True)),
+        ({Sensor.GYRO}, Wheels(), VELOCITY),
+        (set(), Wheels(), VELOCITY),
     ],
 )
-def test_a_bridge_drifts_as_the_sensors_that_measured_it(sensors, drift):
+def test_a_bridge_drifts_as_the_sensors_that_measured_it(sensors, wheels, drift):
     def known(stamp_ns):
         index = stamp_ns // S
         return Known(T_map_base=at(0.5 * index), session=0, module=BRIDGED, covariance=None)
 
-    own = collector(known, Rig(sensors=frozenset(sensors)))
+    own = collector(known, Rig(sensors=frozenset(sensors), wheels=wheels))
     for index in range(12):
         own.add(index * S, None)
     own.finish()

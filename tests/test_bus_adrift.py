@@ -76,7 +76,7 @@ def test_without_rewind_it_begins_at_the_newest_observation(handover):
 def test_where_it_is_after_the_gap_is_as_uncertain_as_the_gap_was_long():
     _, atlas, _, _ = carried(Carried())
     lost_s = (feed(FIRST).stamp_ns - feed(FIRST - 1).stamp_ns) / 1e9
-    sigmas = np.sqrt(np.diagonal(atlas.covariances(has_odometry=False), axis1=1, axis2=2))
+    sigmas = np.sqrt(np.diagonal(atlas.covariances(None), axis1=1, axis2=2))
     assert sigmas[FIRST - 1].max() < 0.1
     expected = np.repeat([lost_s, np.pi / np.sqrt(3.0)], 3)  # 1 m/s, and any heading
     np.testing.assert_allclose(sigmas[FIRST], expected, rtol=0.1)
@@ -88,7 +88,7 @@ def test_the_same_without_a_gap_is_as_certain_as_before():
     modules = {"bright": ExactModule(lost=range(50, 1000)), "dark": ExactModule()}
     _, atlas, _, _ = drive(modules, has_odometry=False, handover="rewind")
     assert len(atlas.session_starts()) == 2
-    sigmas = np.sqrt(np.diagonal(atlas.covariances(has_odometry=False), axis1=1, axis2=2))
+    sigmas = np.sqrt(np.diagonal(atlas.covariances(None), axis1=1, axis2=2))
     assert sigmas.max() < 0.1
 
 
@@ -217,7 +217,7 @@ def test_a_first_choice_that_returns_is_as_certain_of_its_place_as_the_fallback(
     options = {"retry_s": 2.0, "handover": "rewind", "has_odometry": False, "steps": 200}
     _, atlas, _, _ = drive(modules, **options)
     assert atlas.pose_modules[-1] == "bright" and len(atlas.session_starts()) == 3
-    sigmas = np.sqrt(np.diagonal(atlas.covariances(has_odometry=False), axis1=1, axis2=2))
+    sigmas = np.sqrt(np.diagonal(atlas.covariances(None), axis1=1, axis2=2))
     assert sigmas.max() < 0.2
 
 

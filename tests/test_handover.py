@@ -250,7 +250,7 @@ def test_motion_that_nobody_knew_is_counted_where_a_trial_ends_it():
     row = atlas.session_starts()[2].row
     gap_s = np.diff(atlas.trajectory.stamps_ns).max() / 1e9
     assert gap_s > 0.3
-    sigmas = np.sqrt(np.diagonal(atlas.covariances(has_odometry=False), axis1=1, axis2=2))
+    sigmas = np.sqrt(np.diagonal(atlas.covariances(None), axis1=1, axis2=2))
     assert sigmas[row - 1].max() < 0.5 and (sigmas[row:, :3] > 0.9 * gap_s).all()
 
 

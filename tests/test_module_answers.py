@@ -112,7 +112,7 @@ def test_covariances_of_a_trajectory_are_numbers_or_missing():
 def test_a_trajectory_of_narrow_numbers_is_kept_as_the_journal_is_read(tmp_path):
     poses = np.tile(np.eye(4, dtype=np.float32), (3, 1, 1))
     given = Trajectory(stamps_ns=np.arange(3, dtype=np.int32), T_world_base=poses)
-    head = JournalHeader(title="", value_label="", has_odometry=False, began_in="/")
+    head = JournalHeader(title="", value_label="", wheels=None, began_in="/")
     journal = Journal(tmp_path / "journal.bin", head)
     journal.add_end(0, checked_trajectory(given))
     journal.close()

@@ -7,7 +7,7 @@ from sceneslam.interfaces import SlamModule
 from sceneslam.modules.slam.odometry import Odometry
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation, TrackingStatus
-from sceneslam.types.rig import Rig, Sensor
+from sceneslam.types.rig import Rig, Sensor, Wheels
 
 
 def active():
@@ -59,7 +59,7 @@ def test_the_whole_way_counts_once_in_the_atlas():
         atlas.add(
             each.stamp_ns, each.T_local_base, "odometry", each.covariance, each.map_covariance
         )
-    covariances = atlas.covariances(True)[-1], trackings[-1].map_covariance
+    covariances = atlas.covariances(Wheels())[-1], trackings[-1].map_covariance
     found, drifted = (np.sqrt(np.diag(each))[[0, 1, 5]] for each in covariances)
     np.testing.assert_allclose(found, drifted, rtol=0.2)
 

@@ -17,7 +17,7 @@ from sceneslam.modules.slam.laser.module import LaserSlam
 from sceneslam.types import se3
 from sceneslam.types.covariance import unknown_motion
 from sceneslam.types.maps import MapLayers
-from sceneslam.types.rig import Laser, Rig, Sensor
+from sceneslam.types.rig import Laser, Rig, Sensor, Wheels
 from sceneslam.types.run import BRIDGED
 from sceneslam.types.trajectory import Trajectory
 
@@ -76,7 +76,7 @@ def test_pieces_are_joined_where_the_robot_comes_back(turned):
     assert loops
     errors = errors_m(atlas, np.concatenate([first, second]))
     assert errors.max() < 0.3  # the first piece alone drifts by 0.24 m
-    sigmas = np.sqrt(np.diagonal(atlas.covariances(has_odometry=True), axis1=1, axis2=2))
+    sigmas = np.sqrt(np.diagonal(atlas.covariances(Wheels()), axis1=1, axis2=2))
     assert sigmas[-1, [0, 1, 5]].max() < 0.1 and sigmas.max() < 0.2 * LOST_S
 
 
@@ -123,7 +123,7 @@ def test_pieces_stay_apart_where_places_look_alike():
     ahead = np.array([(STEP_M * step, 0.0, 0.0) for step in range(80)])
     atlas, loops = carried(walls, ahead, ahead + np.array([30.0, 0.0, 0.0]))
     assert not loops
-    sigmas = np.sqrt(np.diagonal(atlas.covariances(has_odometry=True), axis1=1, axis2=2))
+    sigmas = np.sqrt(np.diagonal(atlas.covariances(Wheels()), axis1=1, axis2=2))
     assert sigmas[-1, :2].min() > 0.9 * LOST_S
 
 

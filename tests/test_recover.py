@@ -244,7 +244,7 @@ def test_an_atlas_that_is_told_a_journal_is_the_one_it_was_kept_of(tmp_path, see
         np.testing.assert_array_equal(one.stamps_ns, two.stamps_ns)
         np.testing.assert_array_equal(one.T_world_base, two.T_world_base)
     assert atlas.pose_modules == again.pose_modules
-    np.testing.assert_allclose(atlas.covariances(Wheels()), again.covariances(True), rtol=1e-12)
+    np.testing.assert_allclose(atlas.covariances(Wheels()), again.covariances(Wheels()), rtol=1e-12)
 
 
 def test_a_cut_off_run_is_corrected_once(tmp_path):

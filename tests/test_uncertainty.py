@@ -13,18 +13,20 @@ from sceneslam.atlas.submaps.submap import LENGTH_M
 from sceneslam.atlas.uncertainty import (
     MAPPED,
     VELOCITY,
-    WHEELS,
+    of_wheels,
     read_covariances,
     write_covariances,
 )
 from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.storage.events import log_uncertainty
 from sceneslam.types import se3
+from sceneslam.types.rig import Wheels
 from sceneslam.types.trajectory import Trajectory
 
 STEP_M = 0.1
 T_STEP = se3.from_xy_yaw(STEP_M, 0.0, 0.05)
 SUBMAP = round(LENGTH_M / STEP_M)  # poses
+WHEELS = of_wheels(Wheels())
 CLAIM = np.diag([4.0, 4.0, 4.0, 1.0, 1.0, 1.0]) * 1e-6  # 2 mm, 1 mrad
 
 
@@ -206,10 +208,19 @@ def test_claims_of_any_size_are_compared(certain):
     assert found[-1, 0, 0] > 0.0
 
 
+def test_a_bridge_is_as_certain_as_the_wheels_of_the_rig():
+    lost = {"bright": ExactModule(lost=range(20, 100)), "dark": ExactModule(lost=range(100))}
+    _, atlas, _, _ = drive(lost)
+    usual, poor = (
+        np.sqrt(atlas.covariances(Wheels(drift_ratio=ratio))[-1, 0, 0]) for ratio in (0.02, 0.2)
+    )
+    assert poor > 5.0 * usual
+
+
 def test_a_run_logs_how_certain_every_session_was_where_it_began():
     modules = {"bright": ExactModule(), "dark": ExactModule()}
     _, atlas, log, _ = drive(modules, scene_at=lambda i: "Dark" if i >= 40 else "Bright")
-    covariances = atlas.covariances(True)
+    covariances = atlas.covariances(Wheels())
     log_uncertainty(log, atlas.session_starts(), covariances)
     told = events(log, "uncertainty")
     assert [event["module"] for event in told] == ["bright", "dark"]

@@ -19,12 +19,12 @@ from sceneslam.atlas.places.floor_plan import grid_of
 from sceneslam.atlas.pose_path import OpenSession, PoseLog, PosePath, trajectory_of
 from sceneslam.atlas.revision import Revised, revise
 from sceneslam.atlas.submaps.correction import Correction
-from sceneslam.atlas.uncertainty import VELOCITY, WHEELS, Covariance
+from sceneslam.atlas.uncertainty import VELOCITY, Covariance, of_wheels
 from sceneslam.interfaces import TrajectoryLog
 from sceneslam.types.errors import ConfigError, InputError, text_of
 from sceneslam.types.maps import HybridMap, MapLayers
 from sceneslam.types.observation import Observation
-from sceneslam.types.rig import Rig
+from sceneslam.types.rig import Rig, Wheels
 from sceneslam.types.run import BRIDGED, Note, Session, SessionStart
 from sceneslam.types.se3 import Transform, Vector
 from sceneslam.types.trajectory import Trajectory
@@ -268,11 +268,12 @@ class Atlas:
         """Return, per session, the first pose of the trajectory that its module gave."""
         return self._path.session_starts()
 
-    def covariances(self, has_odometry: bool) -> NDArray[np.float64]:
+    def covariances(self, wheels: Wheels | None) -> NDArray[np.float64]:
         """Return the covariances (N, 6, 6) of the trajectory relative to its first pose.
 
         In `base`, translation [m] first, then rotation [rad]; in a loaded map, relative to that.
-        With odometry, bridged poses have the wheels' uncertainty, else that of constant velocity.
+        Bridged poses have the uncertainty of the `wheels`, without odometry (None) that of constant
+        velocity.
         """
         sessions, stamps_ns = self.sessions, np.array(self._path.stamps_ns, np.int64)
         path = PosedPath(
@@ -288,7 +289,8 @@ class Atlas:
             [session.trajectory for session in sessions],
         )
         loops = [] if self._mapper is None else self._mapper.loops(stamps_ns)
-        return covariances(path, loops=loops, bridge=WHEELS if has_odometry else VELOCITY)
+        bridge = VELOCITY if wheels is None else of_wheels(wheels)
+        return covariances(path, loops=loops, bridge=bridge)
 
     @property
     def pose_modules(self) -> tuple[str, ...]:

@@ -11,16 +11,20 @@ from numpy.typing import NDArray
 from sceneslam.atlas.atlas import Atlas
 from sceneslam.types.errors import text_of
 from sceneslam.types.maps import HybridMap, PointLayer
+from sceneslam.types.rig import Wheels
 
 _log = logging.getLogger(__name__)
 
 
 def covariances_of(
-    atlas: Atlas, fault: Callable[[str], None], *, has_odometry: bool
+    atlas: Atlas, fault: Callable[[str], None], *, wheels: Wheels | None
 ) -> NDArray[np.float64]:
-    """Return the covariances (N, 6, 6) of the trajectory; (0, 6, 6) and a fault if they fail."""
+    """Return the covariances (N, 6, 6) of the trajectory; (0, 6, 6) and a fault if they fail.
+
+    `wheels` are those of the run's odometry, None without it.
+    """
     try:
-        return atlas.covariances(has_odometry)
+        return atlas.covariances(wheels)
     except Exception as error:
         _log.info("covariances", exc_info=error)
         fault(f"the trajectory has no covariances: {text_of(error)}")

@@ -369,7 +369,7 @@ class Mapper:
                 why = why if shown else "it shows neither walls nor views"
                 self._warn(0, f"the run will not be found in the loaded map: {why}")
             return None
-        return MapLocalizer(plan, finder, standing=self._loaded.standing)
+        return MapLocalizer(plan, finder, standing=self._loaded.standing, wheels=rig.wheels)
 
     def _scan(self, observation: Observation) -> KeyScan | None:
         """Return the scan of an observation; None without one, or with an invalid measurement."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sceneslam.types import se3
 from sceneslam.types.covariance import TRIANGLE, symmetric, triangle
 from sceneslam.types.files import replacing
+from sceneslam.types.rig import Wheels
 from sceneslam.types.trajectory import parse_stamp_ns, stamp_text
 
 Covariance = NDArray[np.float64]  # (6, 6): T_true = T_told @ exp(xi), xi in base as se3.log has it
@@ -32,12 +33,20 @@ class Drift:
 
 # A module's own covariance is that of its pose relative to its local map, which itself drifts.
 MAPPED = Drift(per_m=0.005, rad_per_m=0.0, rad_per_rad=0.0, rad_per_root=0.003)
-# Defaults of `Wheels` in a rig.
-WHEELS = Drift(per_m=0.02, rad_per_m=0.01, rad_per_rad=0.02, rad_per_root=0.0)
-# With a gyro, whose bias is known to a tenth of a degree per second.
-GYRO = Drift(per_m=0.02, rad_per_m=0.002, rad_per_rad=0.005, rad_per_root=0.0)
 # Constant velocity: the robot may have braked meanwhile.
 VELOCITY = Drift(per_m=0.5, rad_per_m=0.1, rad_per_rad=0.5, rad_per_root=0.0)
+
+
+def of_wheels(wheels: Wheels, *, has_gyro: bool = False) -> Drift:
+    """Return the drift of dead reckoning by wheels, with the turn of a gyro if there is one."""
+    drift = Drift(
+        per_m=wheels.drift_ratio,
+        rad_per_m=wheels.drift_rad_per_m,
+        rad_per_rad=wheels.drift_ratio,
+        rad_per_root=0.0,
+    )
+    # The gyro's bias is known to a tenth of a degree per second.
+    return replace(drift, rad_per_m=0.002, rad_per_rad=0.005) if has_gyro else drift
 
 
 def motions(T_map_base: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -36,6 +36,7 @@ from sceneslam.interfaces import TrajectoryLog
 from sceneslam.types.covariance import TRIANGLE, symmetric, triangle
 from sceneslam.types.errors import InputError
 from sceneslam.types.files import LogFile
+from sceneslam.types.rig import Wheels
 from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import Trajectory
 
@@ -52,7 +53,7 @@ class JournalHeader:
 
     title: str
     value_label: str  # of the detector's votes
-    has_odometry: bool
+    wheels: Wheels | None  # of the odometry, None without it
     began_in: str  # base folder of relative paths
 
 
@@ -165,7 +166,9 @@ def read_journal(path: Path, log: TrajectoryLog) -> Kept:
     for kind, body in _records(data):
         with suppress(ValueError):
             if kind == b"H":
-                head = JournalHeader(**json.loads(body))
+                given = json.loads(body)
+                wheels = given.pop("wheels")
+                head = JournalHeader(**given, wheels=wheels and Wheels(**wheels))
             elif kind == b"O":
                 observed_ns.append(_number(body))
                 log.add_observation(observed_ns[-1])

@@ -143,3 +143,8 @@ class Rig:
     lidar: Lidar | None = None
     wheels: Wheels = Wheels()
     gyro: Gyro = Gyro()
+
+    @property
+    def odometry(self) -> Wheels | None:
+        """Return the errors of the odometry, None without it."""
+        return self.wheels if Sensor.ODOMETRY in self.sensors else None

@@ -17,10 +17,11 @@ from sceneslam.atlas.places.recognition import Recognizer
 from sceneslam.atlas.places.registration import PlanRegistration, register
 from sceneslam.atlas.submaps.graph import on_floor
 from sceneslam.atlas.submaps.own_loops import Path
-from sceneslam.atlas.uncertainty import WHEELS
+from sceneslam.atlas.uncertainty import of_wheels
 from sceneslam.scans.key_scan import KeyScan
 from sceneslam.types import planar, se3
 from sceneslam.types.planar import Planar
+from sceneslam.types.rig import Wheels
 from sceneslam.types.se3 import Transform
 from sceneslam.views.placed_views import Sighting
 from sceneslam.views.view import LandmarkView
@@ -117,12 +118,14 @@ class MapLocalizer:
         views: ViewFinder | None = None,
         *,
         standing: Callable[[Transform], Transform] = np.asarray,
+        wheels: Wheels | None = None,
     ) -> None:
         """Take the map's walls, and its views if the run has a camera.
 
         `standing` gives a pose (4, 4) the height and tilt of a robot that stands there in the map;
-        without it they stay as they are.
+        without it they stay as they are. A run drifts as its `wheels`, None: the usual ones.
         """
+        self._drift = of_wheels(wheels or Wheels())
         self._pieces = [_Piece(0)]  # the last one goes on
         self._walls = Recognizer.of(plan)
         self._views, self._standing = views, standing
@@ -316,10 +319,10 @@ class MapLocalizer:
     def _window(self, T_map_base: Transform, since: NDArray[np.float64]) -> SearchWindow:
         """Return how far around a pose (4, 4) the robot may be, by its path since then (2,)."""
         path_m, turned_rad = self._travelled - since
-        turn_rad = WHEELS.rad_per_m * path_m + WHEELS.rad_per_rad * turned_rad
+        turn_rad = self._drift.rad_per_m * path_m + self._drift.rad_per_rad * turned_rad
         return SearchWindow(
             around=planar.from_transform(T_map_base),
-            half_m=float(_REACH_M + _SIGMAS * WHEELS.per_m * path_m),
+            half_m=float(_REACH_M + _SIGMAS * self._drift.per_m * path_m),
             half_rad=float(_REACH_RAD + _SIGMAS * turn_rad),
         )
 

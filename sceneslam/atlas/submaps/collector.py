@@ -17,7 +17,7 @@ from sceneslam.atlas.submaps.submap import (
     make_submap,
     motion_covariance,
 )
-from sceneslam.atlas.uncertainty import GYRO, MAPPED, VELOCITY, WHEELS
+from sceneslam.atlas.uncertainty import MAPPED, VELOCITY, of_wheels
 from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.scans.key_scan import KeyScan
 from sceneslam.types import se3
@@ -64,8 +64,8 @@ class Collector:
         """
         self.chain = Chain() if rig.camera is None else Chain(T_base_cam=rig.camera.T_base_cam)
         self._known, self._run, self._locate = known, run, locate
-        wheels = GYRO if Sensor.GYRO in rig.sensors else WHEELS
-        self._bridge = wheels if Sensor.ODOMETRY in rig.sensors else VELOCITY
+        wheels = of_wheels(rig.wheels, has_gyro=Sensor.GYRO in rig.sensors)
+        self._bridge = VELOCITY if rig.odometry is None else wheels
         self._open = OpenSubmap()
         self._recent: list[list[KeyPose]] = []  # of the newest submaps, oldest first
         self._waiting: list[_Step] = []  # for their poses
