@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from time import monotonic, sleep
@@ -12,12 +12,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import yaml
 from hydra import compose, initialize_config_module
 from hydra.utils import instantiate
 from isolation import limits
 from omegaconf import OmegaConf
 
 from sceneslam.config.check import check_node
+from sceneslam.config.echo import check_echo
 from sceneslam.modules.slam.process.client import LOST, TRACKING
 from sceneslam.modules.slam.ros2_node.client import NodeClient
 from sceneslam.modules.slam.ros2_node.listener import NodeListener, moved
@@ -59,8 +61,8 @@ def build(behaviour, **changes):
 
 
 @contextmanager
-def active(behaviour):
-    module = build(behaviour)
+def active(behaviour, **changes):
+    module = build(behaviour, **changes)
     module.activate(RIG)
     try:
         yield module
@@ -216,6 +218,41 @@ def test_a_node_that_stops_publishing_tf_gives_no_poses(monkeypatch, tf_age_max_
     assert [count(100.9), count(101.1)] == [1, is_kept]
     node.publish(np.eye(4))
     assert count(101.2) == 1
+
+
+def test_a_node_is_started_on_the_domain_of_its_module():
+    ends = "import os, sys; sys.exit(int(os.environ['ROS_DOMAIN_ID']))"
+    settings = {"command": [sys.executable, "-c", ends], "network": Network(domain_id=7)}
+    with active("", **settings) as module, pytest.raises(ModuleError, match="node ended with 7"):
+        drive(module, lambda found: False)
+
+
+CONF = Path(__file__).resolve().parents[1] / "conf"
+
+
+@pytest.mark.parametrize(
+    ("changes", "is_echo"),
+    [
+        ({}, True),
+        ({"domain_id": 3}, True),  # as ROS_DOMAIN_ID
+        ({"domain_id": 4}, False),
+        ({"map_frame": "sceneslam_map"}, False),
+        ({"map_frame": "sceneslam_map", "map": "/map"}, True),
+        ({"pose_kind": "odometry"}, False),
+        ({"pose_kind": "odometry", "map": "/map"}, True),
+    ],
+)
+def test_a_sink_does_not_publish_on_the_nodes_domain_what_is_read_from_the_node(
+    monkeypatch, changes, is_echo
+):
+    monkeypatch.setenv("ROS_DOMAIN_ID", "3")
+    node = yaml.safe_load((CONF / "slam/ros2_node.yaml").read_text())
+    sink = yaml.safe_load((CONF / "sinks/ros2.yaml").read_text())
+    for key, value in changes.items():
+        {"map": node["topics"], "pose_kind": node}.get(key, sink)[key] = value
+    named = r"slam\.only\.network\.domain_id.*sinks\.robot\.domain_id"
+    with pytest.raises(ConfigError, match=named) if is_echo else nullcontext():
+        check_echo({"only": node}, {"robot": sink})
 
 
 def test_a_node_that_ends_ends_the_session_with_a_sentence():

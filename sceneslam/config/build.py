@@ -13,6 +13,7 @@ from sceneslam.atlas.atlas import Atlas
 from sceneslam.bus.policy import Policy
 from sceneslam.config.check import NOTHING, check_keys
 from sceneslam.config.component import ComponentBuilder
+from sceneslam.config.echo import check_echo
 from sceneslam.config.settings import DETECT_ONLY, LIVE, RunSettings
 from sceneslam.evaluation.settings import EvaluationSettings
 from sceneslam.interfaces import Detector, Live, LiveFeed, Sink, SlamModule, Source
@@ -66,6 +67,7 @@ def build(config: Mapping[str, Any]) -> RunParts:
     atlas = builder.make("atlas", Atlas)
     evaluation = make_evaluation(builder, detector)
     sinks = {key: builder.make(f"sinks.{key}", Sink) for key in _group(config, "sinks")}
+    check_echo({key: config["slam"][key] for key in modules}, _group(config, "sinks"))
     source = make_source(config, builder)
     with ExitStack() as opened:  # closed again if it does not fit
         opened.callback(_release, source)

@@ -57,8 +57,9 @@ class NodeClient:
         self._revision = 0
 
     def activate(self, rig: Fields) -> None:
-        """Join the domain and start the node; its standard output is its log."""
-        self._transport = open_transport(Network(**self._settings["network"]))
+        """Join the domain and start the node in it; its standard output is its log."""
+        network = Network(**self._settings["network"])
+        self._transport = open_transport(network)
         self._heard = NodeListener(self._transport, self._settings)
         self._camera = _camera(rig)
         places = {
@@ -78,7 +79,10 @@ class NodeClient:
         self._T_frame_base = se3.inverse(places[names.CAMERA]) if is_camera else np.eye(4)
         if self._settings["command"] is not None:
             self._node = subprocess.Popen(
-                self._settings["command"], stdin=subprocess.DEVNULL, stdout=sys.stderr
+                self._settings["command"],
+                stdin=subprocess.DEVNULL,
+                stdout=sys.stderr,
+                env=os.environ | {"ROS_DOMAIN_ID": str(network.domain())},
             )
 
     def set_scene(self, scene: str) -> None:
