@@ -251,7 +251,7 @@ def record_gaps(path: Path, seen_s: list[tuple[float, float]], late_ms: int = 0)
         ([(3, 5), (9, 11)], 140, None),
         ([(0, 4)], 140, None),
         ([(10, 14)], 140, None),
-        ([(0, 3), (6, 14)], 140, None),
+        ([(0, 3), (6, 14)], 140, 110),
         ([(0, 3), (3.9, 14)], 131, 131),  # too short a gap
         ([(0, 14)], 140, 140),
     ],

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property, partial
-from itertools import islice, pairwise
-from statistics import median
+from itertools import islice
 from typing import Any
 
 from sceneslam.ros import decode
@@ -39,8 +38,6 @@ from sceneslam.types.input_files import given_path
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig, Sensor, Wheels
 from sceneslam.types.truth import GroundTruth
-
-_RATE_MESSAGES = 20  # from which a topic's rate is known
 
 
 class RosBag:
@@ -101,9 +98,10 @@ class RosBag:
     def length(self) -> int | None:
         """Return the number of messages of the primary topic.
 
-        None if another topic sets the pace at the beginning, at the end, or in a gap.
+        None if another topic sets the pace at the beginning or the end. In a gap of this one, others
+        give observations that are not counted.
         """
-        if self._has_gap or any(sensor is not self._primary for sensor in self._paces()):
+        if any(sensor is not self._primary for sensor in self._paces()):
             return None
         return self._recording.topics[self._by_sensor[self._primary]].count
 
@@ -219,22 +217,6 @@ class RosBag:
         """Return the last message of each of the same sensors."""
         found = {one: self._recording.last(self._by_sensor[one]) for one in self._firsts}
         return {sensor: one for sensor, one in found.items() if one is not None}
-
-    @cached_property
-    def _has_gap(self) -> bool:
-        """Tell whether another sensor may set the pace for a while.
-
-        The primary topic has too few messages then for its span and its rate at the beginning.
-        """
-        first, last = self._firsts.get(self._primary), self._lasts.get(self._primary)
-        if len(self._firsts) < 2 or first is None or last is None:
-            return False
-        topic = self._by_sensor[self._primary]
-        begin = islice(self._recording.messages({topic}), _RATE_MESSAGES)
-        periods_ns = [two.log_ns - one.log_ns for one, two in pairwise(begin)]
-        count = self._recording.topics[topic].count
-        covered_ns = (count - 1) * median(periods_ns or [0])
-        return last.log_ns - first.log_ns - covered_ns > self._silent_after_s * 1e9
 
     def _paces(self) -> Iterator[Sensor]:
         """Yield the sensors that set the pace at the beginning and at the end, if there are any."""
