@@ -46,10 +46,7 @@ def test_it_follows_shading_without_corners():
     off = se3.inverse(se3.inverse(T_first) @ T_last) @ found[-1].T_local_base
     assert np.linalg.norm(off[:3, 3]) < 0.02
     assert all(one.status is TrackingStatus.TRACKING for one in found)
-    layers = module.get_map()
-    assert len(layers.points.points) > 1000
-    graph = layers.pose_graph
-    assert len(graph.edges) == len(graph.stamps_ns) - 1 > 2
+    assert len(module.get_map().points.points) > 1000
 
 
 @pytest.mark.parametrize("odometry", [False, True])

@@ -11,7 +11,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sceneslam.motion.predictor import Prediction, Predictor
 from sceneslam.types import se3
@@ -118,10 +117,8 @@ class DirectSlam(LocalModule):
         return self._predictor.bridged(observation, prediction, can_begin=can_begin)
 
     def get_map(self) -> MapLayers:
-        """Return the keyframes' cloud and their graph, in `local`."""
-        T_cam_base = se3.inverse(self._camera.T_base_cam)
-        graph = self._keyframes.graph(T_cam_base)
-        return MapLayers(points=self._keyframes.cloud(), pose_graph=graph)
+        """Return the keyframes' cloud, in `local`."""
+        return MapLayers(points=self._keyframes.cloud())
 
     def _locate(self, view: DirectView, T_local_guess: se3.Transform) -> _Located | None:
         """Return the view's pose relative to the keyframe, else to the previous view.
@@ -155,7 +152,7 @@ class DirectSlam(LocalModule):
         is_known = is_first and not self._predictor.is_lost
         self._predictor.coast(prediction)
         T_local_base = prediction.T_local_base
-        self._add_keyframe(observation, view, T_local_base @ self._camera.T_base_cam, None)
+        self._add_keyframe(view, T_local_base @ self._camera.T_base_cam)
         if is_first:
             self._predictor.measure(observation, T_local_base, prediction.covariance)
         status = TrackingStatus.TRACKING if is_known else TrackingStatus.DEGRADED
@@ -190,7 +187,7 @@ class DirectSlam(LocalModule):
             away2_m2=found.away2_m2,
         )
         if not se3.is_within(T_key_cam, self.keyframe_step_m, self.keyframe_turn_rad):
-            self._add_keyframe(observation, view, T_local_cam, found.information)
+            self._add_keyframe(view, T_local_cam)
         self._last, self._T_local_last = view, T_local_cam
         limits = np.repeat([self.weak_m, self.weak_rad], 3)
         is_weak = (np.diag(np.linalg.pinv(information, hermitian=True)) > limits**2).any()
@@ -204,14 +201,8 @@ class DirectSlam(LocalModule):
             inliers=found.matched,
         )
 
-    def _add_keyframe(
-        self,
-        observation: Observation,
-        view: DirectView,
-        T_local_cam: se3.Transform,
-        information: NDArray[np.float64] | None,
-    ) -> None:
-        """Make the view the keyframe; without `information` it has no edge to the last one."""
+    def _add_keyframe(self, view: DirectView, T_local_cam: se3.Transform) -> None:
+        """Make the view the keyframe, and the last one that was tracked."""
         self._key = self._last = view
         self._T_local_key = self._T_local_last = T_local_cam
-        self._keyframes.add(observation.stamp_ns, view, T_local_cam, information)
+        self._keyframes.add(view, T_local_cam)
