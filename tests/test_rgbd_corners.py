@@ -3,12 +3,13 @@
 import cv2
 import numpy as np
 import pytest
+from rgbd_features import settings_with
 
 from sceneslam.modules.slam.rgbd.see.corners import CornerFinder
 
 
 def finder_of(count):
-    return CornerFinder(count=count, fast_threshold_min=7, fast_noise_ratio=4.0)
+    return CornerFinder(settings_with(feature_count=count))
 
 
 def texture(contrast_ratio=1.0):

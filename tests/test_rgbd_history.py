@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from rgbd_features import empty_map
+from rgbd_features import empty_map, settings_with
 from test_rgbd_map import CAMERA, keyframe_at
 
 from sceneslam.graphs.edge import Edge, EdgeKind
@@ -20,9 +20,10 @@ from sceneslam.types import se3
 def history():
     visual_map = empty_map(CAMERA, keyframe_limit=99)
     solver = PoseSolver(CAMERA, seed=0)
-    localizer = VisualLocalizer(visual_map, solver, radius_px=20.0, min_inliers=20)
+    settings = settings_with(degraded_inliers=20)
+    localizer = VisualLocalizer(visual_map, solver, settings=settings)
     eye = RectifyingExtractor(visual_map, localizer, None)
-    made = MapHistory(visual_map, localizer, eye, min_inliers=20, is_repeatable=True)
+    made = MapHistory(visual_map, localizer, eye, settings=settings)
     yield made
     made.shutdown()
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from rgbd_features import AT_REST, empty_map, features_at, random_descriptors
+from rgbd_features import AT_REST, empty_map, features_at, random_descriptors, settings_with
 
 from sceneslam.modules.slam.rgbd.locate import recognition
 from sceneslam.modules.slam.rgbd.locate.localizer import VisualLocalizer
@@ -21,6 +21,7 @@ from sceneslam.types import se3
 from sceneslam.types.rig import Camera
 
 CAMERA = Camera(size_wh=(640, 480), fx=525.0, fy=520.0, cx=319.0, cy=241.0)
+FIVE_HUNDRED = settings_with(feature_count=500)
 
 
 def looks(count):
@@ -154,9 +155,7 @@ def patchwork(rng, fine_px=24, coarse_px=48):
 
 def test_features_cover_more_of_the_image_than_the_strongest_corners():
     gray = patchwork(np.random.default_rng(0))
-    extractor = FeatureExtractor(
-        CAMERA, Alignment(), count=500, fast_threshold_min=7, fast_noise_ratio=4.0
-    )
+    extractor = FeatureExtractor(CAMERA, Alignment(), settings=FIVE_HUNDRED)
     spread = extractor.extract(gray, None).uv_px
     strongest = cv2.KeyPoint.convert(cv2.ORB.create(nfeatures=500).detect(gray, None))
     assert len(spread) == 500
@@ -169,9 +168,7 @@ def cells_covered(uv_px):
 
 def test_noise_and_black_give_few_features():
     rng = np.random.default_rng(0)
-    extractor = FeatureExtractor(
-        CAMERA, Alignment(), count=500, fast_threshold_min=7, fast_noise_ratio=4.0
-    )
+    extractor = FeatureExtractor(CAMERA, Alignment(), settings=FIVE_HUNDRED)
     noise = np.clip(rng.normal(20, 4, (480, 640)), 0, 255).astype(np.uint8)
     assert len(extractor.extract(noise, None)) < 150
     assert len(extractor.extract(np.zeros((480, 640), np.uint8), None)) == 0
@@ -180,18 +177,14 @@ def test_noise_and_black_give_few_features():
 @pytest.mark.parametrize("alignment", [Alignment(), Alignment(focal_ratio=0.9, baseline_m=0.02)])
 def test_black_image_of_any_camera_has_no_features(alignment):
     camera = replace(CAMERA, distortion=(0.26, -0.95, -0.005, 0.003, 1.16))
-    extractor = FeatureExtractor(
-        camera, alignment, count=500, fast_threshold_min=7, fast_noise_ratio=4.0
-    )
+    extractor = FeatureExtractor(camera, alignment, settings=FIVE_HUNDRED)
     features = extractor.extract(np.zeros((480, 640), np.uint8), np.ones((480, 640), np.float32))
     assert len(features) == 0
     assert features.descriptors.shape == (0, 32)
 
 
 def test_depth_is_missing_at_depth_edges_and_where_it_is_not_a_number():
-    extractor = FeatureExtractor(
-        CAMERA, Alignment(), count=500, fast_threshold_min=7, fast_noise_ratio=4.0
-    )
+    extractor = FeatureExtractor(CAMERA, Alignment(), settings=FIVE_HUNDRED)
     gray = patchwork(np.random.default_rng(0), fine_px=16, coarse_px=16)
     depth_m = np.full((480, 640), 1.0, np.float32)
     depth_m[:, 320:] = 3.0
@@ -205,9 +198,7 @@ def test_depth_is_missing_at_depth_edges_and_where_it_is_not_a_number():
 
 def test_depth_is_missing_for_colours_that_another_camera_sees_outside_of_the_depth_image():
     alignment = Alignment(focal_ratio=0.7)
-    extractor = FeatureExtractor(
-        CAMERA, alignment, count=500, fast_threshold_min=7, fast_noise_ratio=4.0
-    )
+    extractor = FeatureExtractor(CAMERA, alignment, settings=FIVE_HUNDRED)
     gray = patchwork(np.random.default_rng(0))
     features = extractor.extract(gray, np.ones((480, 640), np.float32))
     centre = np.array([CAMERA.cx, CAMERA.cy])
@@ -246,7 +237,7 @@ def test_landmarks_are_expected_up_to_the_sides_of_a_distorted_image(distortion)
 
 
 def test_points_of_a_camera_with_distortion_lie_on_the_walls():
-    layers = LayerBuilder(BARREL, cloud_stride_px=8, cloud_voxel_m=0.03, grid_resolution_m=0.05)
+    layers = LayerBuilder(BARREL, settings_with())
     image_bgr = np.zeros((480, 640, 3), np.uint8)
     points = layers.view(depth_of_two_walls(np.eye(4)), image_bgr, stamp_ns=0).points_base
     assert len(points) > 4000
@@ -259,14 +250,12 @@ FOLDED = replace(CAMERA, fx=310.0, fy=310.0, distortion=(-0.33, 0.12, 0.0, 0.0, 
 
 def test_pixels_that_no_ray_of_a_folding_lens_reaches_are_missing():
     """This lens shows nothing farther than 301 px from the centre of its image."""
-    layers = LayerBuilder(FOLDED, cloud_stride_px=8, cloud_voxel_m=0.03, grid_resolution_m=0.05)
+    layers = LayerBuilder(FOLDED, settings_with())
     wall_m, image_bgr = np.full((480, 640), 2.0, np.float32), np.zeros((480, 640, 3), np.uint8)
     points = layers.view(wall_m, image_bgr, stamp_ns=0).points_base
     assert 0.75 * 4800 < len(points) < 4800
     assert np.linalg.norm(points[:, 1:], axis=1).max() < 2.0 * 1.64  # it folds at 1.62
-    extractor = FeatureExtractor(
-        FOLDED, Alignment(), count=500, fast_threshold_min=7, fast_noise_ratio=4.0
-    )
+    extractor = FeatureExtractor(FOLDED, Alignment(), settings=FIVE_HUNDRED)
     features = extractor.extract(patchwork(np.random.default_rng(0)), wall_m)
     assert 300 < len(features) < 500
     assert len(features.descriptors) == len(features.levels) == len(features.depth_m)
@@ -278,7 +267,7 @@ def test_pixels_that_no_ray_of_a_folding_lens_reaches_are_missing():
 def test_surfaces_agree_from_another_pose_of_a_camera_with_distortion(monkeypatch):
     monkeypatch.setattr(recognition, "_SURFACE_SLACK_M", 0.01)
     monkeypatch.setattr(recognition, "_SURFACE_SIGMAS", 0.0)
-    layers = LayerBuilder(BARREL, cloud_stride_px=8, cloud_voxel_m=0.03, grid_resolution_m=0.05)
+    layers = LayerBuilder(BARREL, settings_with())
     keyframe, image_bgr = keyframe_at(0, camera=BARREL), np.zeros((480, 640, 3), np.uint8)
     keyframe.view = layers.view(depth_of_two_walls(np.eye(4)), image_bgr, stamp_ns=0)
     recognizer = recognition.PlaceRecognizer(empty_map(BARREL), None, min_inliers=20)
@@ -290,9 +279,7 @@ def test_surfaces_agree_from_another_pose_of_a_camera_with_distortion(monkeypatc
 
 @pytest.mark.parametrize("stride_px", [1, 8, 64, 100])
 def test_surfaces_are_compared_with_any_stride_of_the_cloud(stride_px):
-    layers = LayerBuilder(
-        CAMERA, cloud_stride_px=stride_px, cloud_voxel_m=0.03, grid_resolution_m=0.05
-    )
+    layers = LayerBuilder(CAMERA, settings_with(cloud_stride_px=stride_px))
     wall_m, image_bgr = np.full((480, 640), 2.0, np.float32), np.zeros((480, 640, 3), np.uint8)
     keyframe = keyframe_at(0)
     keyframe.view = layers.view(wall_m, image_bgr, stamp_ns=0)
@@ -306,7 +293,7 @@ def test_surfaces_are_compared_with_any_stride_of_the_cloud(stride_px):
 
 def test_a_few_points_in_sparse_depth_show_no_place():
     """Of 4800 pixels that the cloud takes, 30 have depth."""
-    layers = LayerBuilder(CAMERA, cloud_stride_px=8, cloud_voxel_m=0.03, grid_resolution_m=0.05)
+    layers = LayerBuilder(CAMERA, settings_with())
     sparse_m = np.zeros((480, 640), np.float32)
     sparse_m[4:44:8, 4:52:8] = 2.0
     keyframe = keyframe_at(0)
@@ -319,7 +306,7 @@ def test_a_few_points_in_sparse_depth_show_no_place():
 
 @pytest.mark.parametrize(("height_m", "has_scans"), [(0.0, True), (0.5, False)])
 def test_only_a_robot_in_the_plane_gives_scans(height_m, has_scans):
-    layers = LayerBuilder(CAMERA, cloud_stride_px=8, cloud_voxel_m=0.03, grid_resolution_m=0.05)
+    layers = LayerBuilder(CAMERA, settings_with())
     wall_m, image_bgr = np.full((480, 640), 2.0, np.float32), np.zeros((480, 640, 3), np.uint8)
     keyframe = keyframe_at(0)
     keyframe.T_local_base[2, 3] = height_m
@@ -352,9 +339,7 @@ def test_a_pose_is_told_only_where_a_tenth_of_what_should_show_is_found(shown, i
     descriptors = random_descriptors(rng, 800)
     descriptors[:shown] = mapped.features.descriptors[:shown]
     features = features_at(uv_px, descriptors, depth_m=np.full(800, 2.0))
-    localizer = VisualLocalizer(
-        visual_map, PoseSolver(CAMERA, seed=0), radius_px=20.0, min_inliers=20
-    )
+    localizer = VisualLocalizer(visual_map, PoseSolver(CAMERA, seed=0), settings=settings_with())
     ids = visual_map.keyframes.landmarks_of([0])
     fix = localizer.near(features, se3.identity(), ids)
     assert (fix is not None) == is_found

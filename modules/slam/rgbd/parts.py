@@ -40,56 +40,21 @@ class RgbdParts:
         """Build; `alignment` None: assume registered depth until the search shows otherwise."""
         known = alignment or Alignment()
         camera = known.color_camera(depth_camera)
-        extractor = FeatureExtractor(
-            depth_camera,
-            known,
-            count=settings.feature_count,
-            fast_threshold_min=settings.fast_threshold_min,
-            fast_noise_ratio=settings.fast_noise_ratio,
-        )
-        self.map = VisualMap(
-            camera,
-            depth_camera,
-            sigma_px=settings.sigma_px,
-            inverse_depth_sigma_per_m=settings.inverse_depth_sigma_per_m,
-            keyframe_limit=settings.keyframe_limit,
-            landmark_limit=settings.landmark_limit,
-        )
+        extractor = FeatureExtractor(depth_camera, known, settings=settings)
+        self.map = VisualMap(camera, depth_camera, settings=settings)
         self.localizer = VisualLocalizer(
-            self.map,
-            PoseSolver(camera, seed=settings.seed),
-            radius_px=settings.search_radius_px,
-            min_inliers=settings.min_inliers,
+            self.map, PoseSolver(camera, seed=settings.seed), settings=settings
         )
         self.eye = RectifyingExtractor(self.map, self.localizer, extractor)
-        self.memory = MapHistory(
-            self.map,
-            self.localizer,
-            self.eye,
-            min_inliers=settings.degraded_inliers,
-            is_repeatable=settings.is_repeatable,
-        )
+        self.memory = MapHistory(self.map, self.localizer, self.eye, settings=settings)
         relocalizer = Relocalizer(self.map.keyframes, self.memory.recognizer)
         self.search = Search(self.localizer, relocalizer)
         self.mapping = LocalMapping(
             depth_camera, self.map, alignment=alignment, is_repeatable=settings.is_repeatable
         )
-        self.layers = LayerBuilder(
-            depth_camera,
-            cloud_stride_px=settings.cloud_stride_px,
-            cloud_voxel_m=settings.cloud_voxel_m,
-            grid_resolution_m=settings.grid_resolution_m,
-        )
-        self.keyframe_rule = KeyframeRule(
-            step_m=settings.keyframe_step_m,
-            turn_rad=settings.keyframe_turn_rad,
-            inlier_ratio=settings.keyframe_inlier_ratio,
-        )
-        self.place_rule = PlaceRule(patience_s=settings.segment_patience_s)
-        self.certainty = Certainty(self.map.landmarks)
-        self.health = HealthRule(
-            degraded_inliers=settings.degraded_inliers, degraded_sigma_m=settings.degraded_sigma_m
-        )
+        self.layers = LayerBuilder(depth_camera, settings)
+        self.keyframe_rule, self.place_rule = KeyframeRule(settings), PlaceRule(settings)
+        self.health, self.certainty = HealthRule(settings), Certainty(self.map.landmarks)
 
     def insert(
         self,

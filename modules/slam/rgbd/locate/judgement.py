@@ -13,6 +13,7 @@ from sceneslam.types.se3 import Transform
 
 from ..map.keyframes import KeyframeStore
 from ..see.view import View
+from ..settings import RgbdSettings
 from .localizer import VisualFix
 from .pose_solver import PoseEstimate
 
@@ -29,8 +30,8 @@ class HealthRule:
     direction, or the depth image contradicts it.
     """
 
-    def __init__(self, *, degraded_inliers: int, degraded_sigma_m: float) -> None:
-        self._inliers, self._variance = degraded_inliers, degraded_sigma_m**2
+    def __init__(self, settings: RgbdSettings) -> None:
+        self._inliers, self._variance = settings.degraded_inliers, settings.degraded_sigma_m**2
 
     def judge(self, estimate: PoseEstimate) -> TrackingStatus:
         """Return TRACKING or DEGRADED."""
@@ -50,9 +51,10 @@ class HealthRule:
 class KeyframeRule:
     """Requests a keyframe if none is near, or if the image shows too few known landmarks."""
 
-    def __init__(self, *, step_m: float, turn_rad: float, inlier_ratio: float) -> None:
-        self._per_m, self._per_rad = 1.0 / step_m, 1.0 / turn_rad
-        self._inlier_ratio = inlier_ratio
+    def __init__(self, settings: RgbdSettings) -> None:
+        self._per_m = 1.0 / settings.keyframe_step_m
+        self._per_rad = 1.0 / settings.keyframe_turn_rad
+        self._inlier_ratio = settings.keyframe_inlier_ratio
         self._most_inliers = 0
 
     def restart(self) -> None:
@@ -87,8 +89,8 @@ class KeyframeRule:
 class PlaceRule:
     """Decides whether a new map segment begins at a place that the map does not contain."""
 
-    def __init__(self, *, patience_s: float) -> None:
-        self._patience_s = patience_s
+    def __init__(self, settings: RgbdSettings) -> None:
+        self._patience_s = settings.segment_patience_s
         self._images = 0  # images with enough features since the map was last seen
 
     def restart(self) -> None:
@@ -100,7 +102,7 @@ class PlaceRule:
     ) -> bool:
         """Tell whether enough images were searched in the map for a new segment to begin.
 
-        Without odometry `patience_s` must have passed, too, as the pose is a guess. Without depth,
+        Without odometry the patience must have passed, too, as the pose is a guess. Without depth,
         odometry must have led far from all keyframes, so that landmarks have parallax.
         """
         self._images += view.shows_enough

@@ -12,6 +12,7 @@ from sceneslam.types.se3 import Transform
 
 from ..map.visual_map import VisualMap
 from ..see.features import Features
+from ..settings import RgbdSettings
 from .matching import Matches, match_anywhere, match_near
 from .pose_solver import Consensus, Measurements, PoseEstimate, PoseSolver, Prior
 from .residuals import Sightings
@@ -55,10 +56,10 @@ class VisualLocalizer:
     """Matches features to the map and solves for the pose."""
 
     def __init__(
-        self, visual_map: VisualMap, solver: PoseSolver, *, radius_px: float, min_inliers: int
+        self, visual_map: VisualMap, solver: PoseSolver, *, settings: RgbdSettings
     ) -> None:
         self._map, self._solver = visual_map, solver
-        self._radius_px, self._min_inliers = radius_px, min_inliers
+        self._radius_px, self._min_inliers = settings.search_radius_px, settings.min_inliers
 
     def near(
         self, features: Features, T_predicted: Transform, held_ids: NDArray[np.int64]

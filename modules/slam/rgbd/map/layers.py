@@ -16,6 +16,7 @@ from sceneslam.types.maps import MapLayers, PointLayer, ScanLayer
 from sceneslam.types.rig import Camera
 
 from ..see.lens import undistorted
+from ..settings import RgbdSettings
 from .keyframes import DepthView, Keyframe, nothing_seen
 
 _LOG = logging.getLogger(__name__)
@@ -28,17 +29,10 @@ _PLANAR_TILT_RAD = 0.15
 class LayerBuilder:
     """Keeps the part of every keyframe's depth that the map layers need; builds them on demand."""
 
-    def __init__(
-        self,
-        camera: Camera,
-        *,
-        cloud_stride_px: int,
-        cloud_voxel_m: float,
-        grid_resolution_m: float,
-    ) -> None:
-        self._camera = camera
-        self._voxel_m, self._resolution_m = cloud_voxel_m, grid_resolution_m
-        self._sampled = 2 * (slice(cloud_stride_px // 2, None, cloud_stride_px),)
+    def __init__(self, camera: Camera, settings: RgbdSettings) -> None:
+        self._camera, self._settings = camera, settings
+        stride_px = settings.cloud_stride_px
+        self._sampled = 2 * (slice(stride_px // 2, None, stride_px),)
         width, height = camera.size_wh
         v, u = (axis[self._sampled] for axis in np.mgrid[:height, :width].astype(np.float64))
         uv_image = np.stack([u, v], axis=-1)
@@ -74,7 +68,7 @@ class LayerBuilder:
             return None
         points = np.concatenate([se3.apply(k.T_local_base, k.view.points_base) for k in keyframes])
         colors_bgr = np.concatenate([k.view.colors_bgr for k in keyframes])
-        points, colors_bgr = _thin_by_voxel(points, colors_bgr, self._voxel_m)
+        points, colors_bgr = _thin_by_voxel(points, colors_bgr, self._settings.cloud_voxel_m)
         points.flags.writeable = colors_bgr.flags.writeable = False
         return PointLayer(points=points, colors_bgr=colors_bgr)
 
@@ -89,7 +83,7 @@ class LayerBuilder:
         return scan_layer(
             [scan for scan, _ in scans],
             [T_local_base @ self._scanner.T_base_laser for _, T_local_base in scans],
-            cell_m=self._resolution_m,
+            cell_m=self._settings.grid_resolution_m,
         )
 
 

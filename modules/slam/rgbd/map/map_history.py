@@ -20,6 +20,7 @@ from ..loops.loop_closing import VisualLoopCloser
 from ..loops.loop_detection import LoopDetector, Query
 from ..loops.pose_graph import PoseGraph
 from ..see.rectifying_extractor import RectifyingExtractor
+from ..settings import RgbdSettings
 from .frame_log import FrameLog, joined
 from .keyframes import Keyframe, motion_between
 from .segments import Segments
@@ -39,16 +40,17 @@ class MapHistory:
         localizer: VisualLocalizer,
         eye: RectifyingExtractor,
         *,
-        min_inliers: int,
-        is_repeatable: bool,
+        settings: RgbdSettings,
     ) -> None:
         self._map, self._eye = visual_map, eye
         self._graph, self._frames = PoseGraph(), FrameLog()
         self._keyframes: dict[int, Keyframe] = {}  # as the map has them
-        self.recognizer = PlaceRecognizer(visual_map, localizer, min_inliers=min_inliers)
+        self.recognizer = PlaceRecognizer(
+            visual_map, localizer, min_inliers=settings.degraded_inliers
+        )
         detector = LoopDetector(visual_map, self.recognizer, self._graph)
         self._closer = VisualLoopCloser(
-            visual_map, detector, self._graph, is_repeatable=is_repeatable
+            visual_map, detector, self._graph, is_repeatable=settings.is_repeatable
         )
         self.segments = Segments(self._graph, self._keyframes)
         self.reference = _NEVER_SAW  # the keyframe that the newest frame refers to

@@ -15,6 +15,7 @@ from sceneslam.types.se3 import Transform
 from ..see.corners import LEVELS, SCALE
 from ..see.features import Features
 from ..see.lens import undistorted_bounds
+from ..settings import RgbdSettings
 from .keyframes import NO_LANDMARK, Keyframe, KeyframeStore
 from .landmarks import LandmarkTable, Looks
 from .shifts import learn_shifts
@@ -50,26 +51,17 @@ class Doubts:
 class VisualMap:
     """Landmarks and keyframes in `local`, kept within limits by `keep_limits`."""
 
-    def __init__(
-        self,
-        camera: Camera,
-        depth_camera: Camera,
-        *,
-        sigma_px: float,
-        inverse_depth_sigma_per_m: float,
-        keyframe_limit: int,
-        landmark_limit: int,
-    ) -> None:
+    def __init__(self, camera: Camera, depth_camera: Camera, *, settings: RgbdSettings) -> None:
         self.landmarks, self.keyframes = LandmarkTable(), KeyframeStore()
         self.camera, self.depth_camera = camera, depth_camera
         self._bounds_px = undistorted_bounds(camera)
-        self._sigma_px, self.inverse_depth_sigma_per_m = sigma_px, inverse_depth_sigma_per_m
-        self._keyframe_limit, self._landmark_limit = keyframe_limit, landmark_limit
+        self._settings = settings
+        self.inverse_depth_sigma_per_m = settings.inverse_depth_sigma_per_m
         self.corrections = 0  # how often keyframes were moved
 
     def sigma_px(self, levels: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the standard deviations (N,) [px] of features of these pyramid levels (N,)."""
-        return np.asarray(self._sigma_px * _SCALES.take(levels))
+        return np.asarray(self._settings.sigma_px * _SCALES.take(levels))
 
     def inverse_depth_sigmas_per_m(self, features: Features) -> NDArray[np.float64]:
         """Return the standard deviations (N,) [1/m] of the features' inverse depths.
@@ -226,8 +218,9 @@ class VisualMap:
 
     def keep_limits(self) -> None:
         """Remove keyframes beyond the limits, and the landmarks that no other one shows."""
-        while len(self.keyframes) > self._keyframe_limit or (
-            len(self.landmarks) > self._landmark_limit and len(self.keyframes) > _FEWEST_KEYFRAMES
+        limits = self._settings
+        while len(self.keyframes) > limits.keyframe_limit or (
+            len(self.landmarks) > limits.landmark_limit and len(self.keyframes) > _FEWEST_KEYFRAMES
         ):
             self.keyframes.remove(self.keyframes.most_redundant())
             orphans = self.landmarks.alive.copy()

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from sceneslam.views.grey_noise import grey_noise
 
+from ..settings import RgbdSettings
 from .cores import thread_beside
 
 LEVELS = 8
@@ -96,10 +97,9 @@ class _Octave:
 class CornerFinder:
     """Finds corners on all levels of an image, on half of them in a second thread."""
 
-    def __init__(self, *, count: int, fast_threshold_min: int, fast_noise_ratio: float) -> None:
-        self._count = count
-        self._threshold_min, self._noise_ratio = fast_threshold_min, fast_noise_ratio
-        shares = SCALE ** -np.arange(LEVELS)
+    def __init__(self, settings: RgbdSettings) -> None:
+        self._settings = settings
+        count, shares = settings.feature_count, SCALE ** -np.arange(LEVELS)
         quotas = np.rint(_SURPLUS * count * shares / shares.sum()).astype(int).tolist()
         self._octaves = [_Octave(quota) for quota in quotas]
         self._beside = thread_beside("rgbd-corners")
@@ -113,7 +113,7 @@ class CornerFinder:
         pyramid = shrunk.result()
         found |= self._detect(pyramid, _REST, threshold) | coming.result()
         detected = [found[level] for level in range(LEVELS)]
-        chosen = _spread(detected, self._count)
+        chosen = _spread(detected, self._settings.feature_count)
         described = self._beside.submit(self._describe, pyramid, detected, chosen, _BESIDE)
         parts = self._describe(pyramid, detected, chosen, _FIRST + _REST) | described.result()
         uv_px = [
@@ -127,8 +127,8 @@ class CornerFinder:
 
     def _threshold(self, gray: Image) -> int:
         """Return the FAST threshold [grey levels]: a multiple of the noise, within limits."""
-        threshold = self._noise_ratio * grey_noise(gray)
-        return int(np.clip(threshold, self._threshold_min, _THRESHOLD_MAX))
+        threshold = self._settings.fast_noise_ratio * grey_noise(gray)
+        return int(np.clip(threshold, self._settings.fast_threshold_min, _THRESHOLD_MAX))
 
     def _detect(
         self, pyramid: Sequence[Image], levels: Sequence[int], threshold: int

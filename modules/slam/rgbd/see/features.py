@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from sceneslam.types.rig import Camera
 
+from ..settings import RgbdSettings
 from .alignment import Alignment
 from .corners import CornerFinder
 from .lens import undistorted
@@ -41,19 +42,11 @@ class FeatureExtractor:
     """Finds features where the image holds structure above its own noise."""
 
     def __init__(
-        self,
-        depth_camera: Camera,
-        alignment: Alignment,
-        *,
-        count: int,
-        fast_threshold_min: int,
-        fast_noise_ratio: float,
+        self, depth_camera: Camera, alignment: Alignment, *, settings: RgbdSettings
     ) -> None:
         self._depth_camera, self._alignment = depth_camera, alignment
         self._camera = alignment.color_camera(depth_camera)
-        self._corners = CornerFinder(
-            count=count, fast_threshold_min=fast_threshold_min, fast_noise_ratio=fast_noise_ratio
-        )
+        self._corners = CornerFinder(settings)
 
     def extract(self, gray: NDArray[np.uint8], depth_m: NDArray[np.float32] | None) -> Features:
         """Return the features of `gray` (H, W); without a depth image all depths are missing."""
