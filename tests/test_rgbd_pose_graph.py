@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.graphs.factors import fit
+from sceneslam.modules.slam.frame_log import FrameLog
 from sceneslam.modules.slam.rgbd.loops.pose_graph import PoseGraph
-from sceneslam.modules.slam.rgbd.map.frame_log import FrameLog
 from sceneslam.types import se3
 
 TWISTS = st.lists(st.floats(-1.0, 1.0), min_size=6, max_size=6).map(np.array)

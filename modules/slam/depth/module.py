@@ -15,10 +15,10 @@ from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.trajectory import Trajectory
 
 from ..camera_certainty import CameraCertainty
+from ..frame_log import FrameLog
 from ..local import LocalModule
 from ..surfaces.registration import CameraPrior, Samples, SurfaceRegistration, samples_of
 from ..surfaces.surface import DepthSurfaceReader, Doubles, Surface
-from .history import PoseHistory
 from .keyframe_map import KeyframeMap
 from .localizer import DepthLocalizer
 from .pose_graph import DepthPoseGraph
@@ -67,7 +67,7 @@ class DepthSlam(LocalModule):
             self._map, matched_min_ratio=self.matched_min_ratio, weak_ratio=self.weak_ratio
         )
         self._certainty = CameraCertainty(rig.camera.T_base_cam)
-        self._history = PoseHistory(self._map)
+        self._frames = FrameLog()
         self._predictor = Predictor(rig)
         self._reference, self._revision = 0, 0
 
@@ -97,7 +97,9 @@ class DepthSlam(LocalModule):
     def get_trajectory(self) -> Trajectory:
         """Return all poses after a last optimisation."""
         self._graph.finish()
-        return self._history.trajectory()
+        return self._frames.trajectory(
+            {index: keyframe.T_local_cam for index, keyframe in enumerate(self._map.keyframes)}
+        )
 
     def get_map(self) -> MapLayers:
         """Return the keyframes' cloud in `local`."""
@@ -193,11 +195,11 @@ class DepthSlam(LocalModule):
         self._graph.connect(self._reference, in_cam)
 
     def _answer(self, tracking: Tracking) -> Tracking:
-        """Return the answer with the map's revision and certainty; its pose joins the history."""
+        """Return the answer with the map's revision and certainty; its pose joins the frames."""
         covariance = tracking.covariance
         if covariance is not None:  # it has a pose
             covariance = self._certainty.covariance(covariance)
             if len(self._map):
-                T_local_base = tracking.T_local_base
-                self._history.add(tracking.stamp_ns, self._reference, T_local_base)
+                T_key_base = self._map[self._reference].T_cam_local @ tracking.T_local_base
+                self._frames.add(tracking.stamp_ns, self._reference, T_key_base)
         return replace(tracking, covariance=covariance, revision=self._revision)

@@ -13,6 +13,7 @@ from sceneslam.types.maps import LandmarkLayer, PoseGraphLayer
 from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import Trajectory
 
+from ...frame_log import FrameLog, joined
 from ...model_error import motion_covariance
 from ..locate.localizer import VisualFix, VisualLocalizer
 from ..locate.recognition import PlaceRecognizer
@@ -21,7 +22,6 @@ from ..loops.loop_detection import LoopDetector, Query
 from ..loops.pose_graph import PoseGraph
 from ..see.rectifying_extractor import RectifyingExtractor
 from ..settings import RgbdSettings
-from .frame_log import FrameLog, joined
 from .keyframes import Keyframe, motion_between
 from .segments import Segments
 from .visual_map import VisualMap

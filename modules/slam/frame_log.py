@@ -1,4 +1,4 @@
-"""Poses of all frames relative to their keyframes, so that they follow its corrections."""
+"""Poses of all frames relative to their keyframes, so that they follow their corrections."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class FrameLog:
         self._stamps_ns = np.zeros(_FIRST_CAPACITY, np.int64)
         self._keyframe_ids = np.zeros(_FIRST_CAPACITY, np.int32)
         self._T_keyframe_base = np.zeros((_FIRST_CAPACITY, 3, 4))
-        self._twist_per_s = np.zeros((_FIRST_CAPACITY, 6))  # see Turning
+        self._twist_per_s = np.zeros((_FIRST_CAPACITY, 6))  # see rgbd.see.shutter.Turning
         self._count = 0
 
     def __len__(self) -> int:
@@ -32,7 +32,7 @@ class FrameLog:
         stamp_ns: int,
         keyframe_id: int,
         T_keyframe_base: Transform,
-        twist_per_s: NDArray[np.float64],
+        twist_per_s: NDArray[np.float64] | float = 0.0,
     ) -> None:
         """Add a frame relative to a keyframe; `twist_per_s` (6,): per second of longer readout."""
         if self._count == len(self._stamps_ns):
