@@ -62,8 +62,8 @@ ALLOWED = {  # package -> what of ours it may import
 
 
 SLAM = {  # what more than one SLAM module may use
-    "camera_certainty", "cloud_shape", "clouds", "degeneracy", "frame_log", "local", "model_error", "process",
-    "surfaces", "cloud_odometry", "cloud_map", "voxel_cloud", "quiet"}  # fmt: skip
+    "camera_certainty", "cloud_shape", "clouds", "degeneracy", "frame_log", "local", "model_error",
+    "process", "surfaces", "cloud_odometry", "cloud_map", "voxel_cloud", "quiet"}  # fmt: skip
 
 
 @pytest.mark.parametrize("package", ALLOWED)
