@@ -38,7 +38,7 @@ def loops(off_rad, *, stretch=0, gone=None):
     def recognize(candidate, features, depth_m):
         T_local_base = se3.from_xy_yaw(0.0, 0.0, off_rad) @ keyframes[recognized].T_local_base
         estimate = SimpleNamespace(T_local_base=T_local_base, covariance=1e-8 * np.eye(6))
-        return SimpleNamespace(keyframe_id=candidate, fix=SimpleNamespace(estimate=estimate))
+        return SimpleNamespace(estimate=estimate)
 
     visual_map = SimpleNamespace(keyframes=keyframes)
     detector = LoopDetector(visual_map, SimpleNamespace(recognize=recognize), graph)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,6 +12,7 @@ from sceneslam.views.place_index import PlaceIndex
 from ...surfaces.undistortion import DepthUndistortion
 from ..map.keyframes import Keyframe
 from ..map.visual_map import VisualMap
+from ..see.alignment import look_up
 from ..see.features import Features
 from .localizer import VisualFix, VisualLocalizer
 
@@ -23,14 +22,6 @@ _MIN_COMMON_RATIO = 0.02  # of the pixels of a keyframe's cloud, in both depth i
 _MIN_COMMON_POINTS = 5  # where its cloud is coarse
 _SURFACE_SLACK_M = 0.05  # tolerance for the pose error
 _SURFACE_SIGMAS = 4.0  # of one depth, so 2.8 of a difference
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Recognition:
-    """A pose in the map, and the keyframe by which it was found."""
-
-    keyframe_id: int
-    fix: VisualFix
 
 
 class PlaceRecognizer:
@@ -50,7 +41,7 @@ class PlaceRecognizer:
 
     def recognize(
         self, keyframe_id: int, features: Features, depth_m: NDArray[np.float32] | None
-    ) -> Recognition | None:
+    ) -> VisualFix | None:
         """Return the pose at which a keyframe agrees with an image and depth (H, W) [m]."""
         if len(features) < self._min_inliers:
             return None
@@ -63,7 +54,7 @@ class PlaceRecognizer:
             return None
         if depth_m is not None and not self._shows(keyframe, fix.estimate.T_local_base, depth_m):
             return None
-        return Recognition(keyframe_id=keyframe_id, fix=fix)
+        return fix
 
     def _shows(
         self, keyframe: Keyframe, T_local_base: Transform, depth_m: NDArray[np.float32]
@@ -82,10 +73,7 @@ class PlaceRecognizer:
         z = points_cam[:, 2]
         uv_px = points_cam[:, :2] / z[:, None] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
         depth_m = self._undistortion.apply(depth_m)
-        column, row = np.rint(uv_px).astype(np.int64).T
-        inside = (column >= 0) & (column < camera.size_wh[0])
-        inside &= (row >= 0) & (row < camera.size_wh[1])
-        seen_m, z = depth_m[row[inside], column[inside]], z[inside]
+        seen_m = look_up(depth_m[None], np.zeros(len(z), np.int64), uv_px)
         measured = camera.measures(seen_m)
         if measured.sum() < max(_MIN_COMMON_RATIO * pixels, _MIN_COMMON_POINTS):
             return False

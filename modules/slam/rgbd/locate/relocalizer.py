@@ -10,7 +10,7 @@ from sceneslam.types import se3
 from ..map.keyframes import KeyframeStore
 from ..see.features import Features
 from .localizer import VisualFix
-from .recognition import PlaceRecognizer, Recognition
+from .recognition import PlaceRecognizer
 
 _ALIKE = 3  # keyframes tried per image
 _RECENT = 1  # newest keyframes tried in any case
@@ -34,22 +34,22 @@ class Relocalizer:
         alike = [found.place_id for found in self._recognizer.places.alike(features.descriptors)]
         recent = self._keyframes.ids[-_RECENT:]
         for keyframe_id in dict.fromkeys(alike[:_ALIKE] + recent):
-            seen = self._recognizer.recognize(keyframe_id, features, depth_m)
-            if seen is not None:
-                rivals = self._rivals(seen, alike)
+            fix = self._recognizer.recognize(keyframe_id, features, depth_m)
+            if fix is not None:
+                rivals = self._rivals(fix, alike)
                 others = [self._recognizer.recognize(k, features, depth_m) for k in rivals]
-                is_clear = all(other is None or _is_same_place(seen, other) for other in others)
-                return seen.fix if is_clear else None
+                is_clear = all(other is None or _is_same_place(fix, other) for other in others)
+                return fix if is_clear else None
         return None
 
-    def _rivals(self, seen: Recognition, alike: list[int]) -> list[int]:
+    def _rivals(self, fix: VisualFix, alike: list[int]) -> list[int]:
         """Return the most similar keyframes that were taken elsewhere."""
-        here = seen.fix.estimate.T_local_base
+        here = fix.estimate.T_local_base
         poses = {k: self._keyframes[k].T_local_base for k in alike}
         away = {k: se3.inverse(here) @ T for k, T in poses.items()}
         return [k for k, T in away.items() if not se3.is_within(T, _AWAY_M, _AWAY_RAD)][:_RIVALS]
 
 
-def _is_same_place(one: Recognition, other: Recognition) -> bool:
-    T_local_base, T_other = (seen.fix.estimate.T_local_base for seen in (one, other))
+def _is_same_place(one: VisualFix, other: VisualFix) -> bool:
+    T_local_base, T_other = (fix.estimate.T_local_base for fix in (one, other))
     return se3.is_within(se3.inverse(T_local_base) @ T_other, _SAME_M, _SAME_RAD)

@@ -13,7 +13,8 @@ from sceneslam.types.se3 import Transform
 from sceneslam.types.spread import spread
 
 from ...model_error import motion_covariance
-from ..locate.recognition import PlaceRecognizer, Recognition
+from ..locate.localizer import VisualFix
+from ..locate.recognition import PlaceRecognizer
 from ..map.keyframes import motion_between
 from ..map.visual_map import VisualMap
 from .pose_graph import PoseGraph
@@ -85,10 +86,10 @@ class LoopDetector:
     def check(self, query: Query, candidate: int) -> list[LoopClosure]:
         """Return the loops that two keyframes agree on: this one's and an earlier one's."""
         new = self._map.keyframes[query.keyframe_id]
-        seen = self._recognizer.recognize(candidate, new.features, query.depth_m)
-        if seen is None:
+        fix = self._recognizer.recognize(candidate, new.features, query.depth_m)
+        if fix is None:
             return []
-        loop = self._loop(query.keyframe_id, seen)
+        loop = self._loop(candidate, query.keyframe_id, fix)
         if not self._is_plausible(loop):
             return []
         earlier, self._hypothesis = self._hypothesis, loop
@@ -132,15 +133,15 @@ class LoopDetector:
             turn_rad + _SIGMAS * sigmas[3:].max(),
         )
 
-    def _loop(self, keyframe_id: int, seen: Recognition) -> LoopClosure:
-        T_old = self._map.keyframes[seen.keyframe_id].T_local_base
-        T_local_base = seen.fix.estimate.T_local_base
+    def _loop(self, old: int, new: int, fix: VisualFix) -> LoopClosure:
+        T_old = self._map.keyframes[old].T_local_base
+        T_local_base = fix.estimate.T_local_base
         T_first_second = se3.inverse(T_old) @ T_local_base
         edge = Edge(
-            first=seen.keyframe_id,
-            second=keyframe_id,
+            first=old,
+            second=new,
             T_first_second=T_first_second,
-            covariance=motion_covariance(T_first_second, seen.fix.estimate.covariance),
+            covariance=motion_covariance(T_first_second, fix.estimate.covariance),
             kind=EdgeKind.LOOP,
         )
         return LoopClosure(edge=edge, T_local_base=T_local_base)
