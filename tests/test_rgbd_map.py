@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from rgbd_features import AT_REST, empty_map, features_at, random_descriptors, settings_with
 
+from sceneslam.modules.slam.rgbd.adjust.fusion import fuse_duplicates
 from sceneslam.modules.slam.rgbd.locate import recognition
 from sceneslam.modules.slam.rgbd.locate.localizer import VisualLocalizer
 from sceneslam.modules.slam.rgbd.locate.pose_solver import PoseSolver
-from sceneslam.modules.slam.rgbd.loops.loop_fusion import fuse_duplicates
 from sceneslam.modules.slam.rgbd.map.keyframes import DepthView, Keyframe, KeyframeStore
 from sceneslam.modules.slam.rgbd.map.landmarks import LandmarkTable, Looks
 from sceneslam.modules.slam.rgbd.map.layers import LayerBuilder

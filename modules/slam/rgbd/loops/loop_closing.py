@@ -10,10 +10,10 @@ from sceneslam.graphs.factors import fit
 from sceneslam.types import se3
 from sceneslam.types.se3 import Transform
 
+from ..adjust.fusion import fuse_duplicates
 from ..map.visual_map import VisualMap
 from ..see.cores import thread_beside
 from .loop_detection import LoopClosure, LoopDetector, Query
-from .loop_fusion import fuse_duplicates
 from .pose_graph import PoseGraph
 
 _MERGE_IMAGES = 10  # after which a merge is due; a repeatable one waits for the worker
