@@ -12,14 +12,15 @@ from time import sleep
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.interfaces import SlamModule, closes_own_loops
+from sceneslam.interfaces import SlamModule
 from sceneslam.types import se3
 from sceneslam.types.fault_plan import FaultPlan
-from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
 from sceneslam.types.ranges import check_least
-from sceneslam.types.rig import Rig, Sensor
+from sceneslam.types.rig import Rig
 from sceneslam.types.trajectory import Trajectory
+
+from .local import WrappedModule
 
 IN_ANY_PROCESS = ("raise", "nan", "jump", "silence")
 # With run.isolation=process only; else the main process would fail.
@@ -29,12 +30,14 @@ _HANG_S = 3600.0
 _GULP = 1 << 22  # numbers of 8 bytes
 
 
-class FaultyModule:
+class FaultyModule(WrappedModule):
     """Passes all calls on to `module`, and injects faults at random observations.
 
     `silence`: it reports LOST for `lasting_s`. `jump`: its poses are off by `jump_m` in a random
     direction until the next activation, without any report.
     """
+
+    _system: SlamModule
 
     def __init__(
         self,
@@ -47,7 +50,7 @@ class FaultyModule:
         record: Path,
     ) -> None:
         check_least(0, lasting_s=lasting_s, jump_m=jump_m)
-        self._module, self._jump_m = module, jump_m
+        self._system, self._jump_m = module, jump_m
         self._lasting_ns = round(lasting_s * 1e9)
         self._plan = FaultPlan(
             kinds=faults, known=FAULTS, rate_ratio=rate_ratio, seed=seed, record=record
@@ -55,28 +58,14 @@ class FaultyModule:
         self._silent_until_ns: int | None = None
         self._T_wrong_local = se3.identity()
 
-    @property
-    def closes_loops(self) -> bool:
-        """Tell whether the module closes loops itself."""
-        return closes_own_loops(self._module)
-
-    @property
-    def requires(self) -> tuple[frozenset[Sensor], ...]:
-        """Return what the module requires."""
-        return self._module.requires
-
     def activate(self, rig: Rig) -> None:
         """Start a session without active faults."""
         self._silent_until_ns, self._T_wrong_local = None, se3.identity()
-        self._module.activate(rig)
+        self._system.activate(rig)
 
     def set_pose(self, T_map_local: se3.Transform) -> None:
         """Set T_map_local (4, 4) [m]."""
-        self._module.set_pose(T_map_local)
-
-    def set_scene(self, scene: str) -> None:
-        """Set the confirmed scene."""
-        self._module.set_scene(scene)
+        self._system.set_pose(T_map_local)
 
     def track(self, observation: Observation) -> Tracking:
         """Return the module's result, unless a fault is active."""
@@ -87,7 +76,7 @@ class FaultyModule:
             self._silent_until_ns = observation.stamp_ns + self._lasting_ns
         if fault == "jump":
             self._T_wrong_local = self._off(observation.stamp_ns)
-        tracking = self._module.track(observation)
+        tracking = self._system.track(observation)
         T_local_base = self._T_wrong_local @ tracking.T_local_base
         if fault == "nan":
             T_local_base = np.full((4, 4), np.nan)
@@ -99,15 +88,7 @@ class FaultyModule:
 
     def get_trajectory(self) -> Trajectory:
         """Return the module's trajectory, without faults."""
-        return self._module.get_trajectory()
-
-    def get_map(self) -> MapLayers:
-        """Return the module's map."""
-        return self._module.get_map()
-
-    def shutdown(self) -> None:
-        """Shut the module down."""
-        self._module.shutdown()
+        return self._system.get_trajectory()
 
     def _off(self, stamp_ns: int) -> se3.Transform:
         direction = np.random.default_rng([stamp_ns % 2**64]).normal(size=3)

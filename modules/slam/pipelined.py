@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-from sceneslam.interfaces import PipelinedSlam, closes_own_loops
+from sceneslam.interfaces import PipelinedSlam
 from sceneslam.motion.late import Pipeline
 from sceneslam.types.errors import ConfigError
-from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import Observation, Tracking
 from sceneslam.types.ranges import check_least
-from sceneslam.types.rig import Rig, Sensor
+from sceneslam.types.rig import Rig
 from sceneslam.types.trajectory import Trajectory
 
-from .local import LocalModule
+from .local import WrappedModule
 
 
-class Pipelined(LocalModule):
+class Pipelined(WrappedModule):
     """Implements `SlamModule` by a `PipelinedSlam`.
 
     Until the pose of an observation arrives, the newest pose is extrapolated by odometry (constant
     velocity without odometry) and reported as DEGRADED; after `late_max_s` as LOST.
     """
+
+    _system: PipelinedSlam
 
     def __init__(self, system: PipelinedSlam, late_max_s: float) -> None:
         if not isinstance(system, PipelinedSlam):
@@ -28,24 +29,10 @@ class Pipelined(LocalModule):
         self._system, self._late_max_s = system, late_max_s
         self._pipeline = Pipeline(late_max_s)
 
-    @property
-    def closes_loops(self) -> bool:
-        """Tell whether the system closes loops itself."""
-        return closes_own_loops(self._system)
-
-    @property
-    def requires(self) -> tuple[frozenset[Sensor], ...]:
-        """Return the system's required sensors."""
-        return self._system.requires
-
     def activate(self, rig: Rig) -> None:
         """Start a session."""
         self._pipeline = Pipeline(self._late_max_s, rig.wheels)
         self._system.activate(rig)
-
-    def set_scene(self, scene: str) -> None:
-        """Pass the scene to the system."""
-        self._system.set_scene(scene)
 
     def track(self, observation: Observation) -> Tracking:
         """Return the pose at the observation; raises ValueError for poses with unknown stamps."""
@@ -59,11 +46,3 @@ class Pipelined(LocalModule):
     def get_trajectory(self) -> Trajectory:
         """Return the system's revised poses, else those that came late, if any."""
         return self._pipeline.trajectory(self._system.get_trajectory())
-
-    def get_map(self) -> MapLayers:
-        """Return the system's map."""
-        return self._system.get_map()
-
-    def shutdown(self) -> None:
-        """Shut the system down."""
-        self._system.shutdown()
