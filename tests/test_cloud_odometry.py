@@ -145,6 +145,12 @@ def test_a_setting_that_makes_no_sense_is_named(key, value):
         Around(**(SETTINGS | {key: value}))
 
 
+def test_a_library_that_is_missing_is_named(monkeypatch):
+    monkeypatch.setattr(Around, "library", "no_such_library")
+    with pytest.raises(ConfigError, match=r"pip install 'sceneslam\[no_such_library\]'"):
+        Around(**SETTINGS)
+
+
 def test_quiet_drops_standard_output_and_gives_it_back(capfd):
     with quiet():
         os.write(1, b"a page of status")

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, fields
+from importlib.util import find_spec
+from typing import ClassVar
 
 import numpy as np
 
@@ -38,6 +40,7 @@ _DIFFUSE = 1e6  # prediction's variances in units of a cloud's, if ICP decides a
 class CloudOdometry(LocalModule, ABC):
     """Implements `SlamModule` by a `CloudMap`; the settings are described in each YAML file."""
 
+    library: ClassVar[str | None] = None  # an extra that has to be installed, named as its package
     voxel_m: float | None
     depth_range_max_m: float
     depth_stride_px: int
@@ -52,7 +55,10 @@ class CloudOdometry(LocalModule, ABC):
     _predictor: Predictor = field(init=False)
 
     def __post_init__(self) -> None:
-        """Check the settings."""
+        """Check the settings, and that the library is installed."""
+        if self.library is not None and find_spec(self.library) is None:
+            name = type(self).__name__
+            raise ConfigError("_target_", name, f"pip install 'sceneslam[{self.library}]'")
         if not 0 <= self.overlap_min_ratio <= 1:
             raise ConfigError("overlap_min_ratio", self.overlap_min_ratio, "0 to 1")
         if not 0 <= self.weak_ratio < 1:

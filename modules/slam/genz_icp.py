@@ -8,14 +8,12 @@ its pipeline accepts no initial guess, and keeps the voxel size across runs.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from importlib.util import find_spec
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.types import se3
-from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import Observation
 
 from .cloud_map import CloudMap
@@ -31,17 +29,12 @@ _VOXEL_RANGE_M = (0.02, 2.0)  # limits of the adaptive voxel size, as in the lib
 class GenzIcp(CloudOdometry):
     """Registers 3D clouds; the settings are described in `conf/slam/genz_icp.yaml`."""
 
+    library: ClassVar[str | None] = "genz_icp"
     points_desired: int
     planarity_max: float
     initial_threshold_m: float | None
     motion_min_m: float | None
     iterations_max: int
-
-    def __post_init__(self) -> None:
-        """Check the settings, and that the library is installed."""
-        if find_spec("genz_icp") is None:
-            raise ConfigError("_target_", "GenzIcp", "pip install 'sceneslam[genz_icp]'")
-        super().__post_init__()
 
     def make_map(self, voxel_m: float, reader: CloudReader) -> CloudMap:
         """Return the library's map."""

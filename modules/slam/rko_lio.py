@@ -8,15 +8,13 @@ world with gravity; its motions between clouds are used.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from importlib.util import find_spec
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.scans.deskew import valid_times_s
 from sceneslam.types import se3
-from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Sensor
 
@@ -30,16 +28,11 @@ from .quiet import quiet
 class RkoLio(CloudOdometry):
     """Registers a lidar's clouds; the settings are described in `conf/slam/rko_lio.yaml`."""
 
+    library: ClassVar[str | None] = "rko_lio"
     correspondence_max_m: float | None
     is_at_rest_first: bool
     depth_range_max_m: float = field(default=1.0, init=False)  # depth is not used
     depth_stride_px: int = field(default=1, init=False)
-
-    def __post_init__(self) -> None:
-        """Check the settings, and that the library is installed."""
-        if find_spec("rko_lio") is None:
-            raise ConfigError("_target_", "RkoLio", "pip install 'sceneslam[rko_lio]'")
-        super().__post_init__()
 
     @property
     def requires(self) -> tuple[frozenset[Sensor], ...]:
