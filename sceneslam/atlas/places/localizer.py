@@ -82,6 +82,11 @@ class Fix:
     piece_ns: int = 0  # here its piece of the run begins
 
     @property
+    def T_map_run(self) -> Transform:
+        """Return T_map_run (4, 4) by this pose."""
+        return self.T_map_base @ se3.inverse(self.T_run_base)
+
+    @property
     def deviation_m(self) -> float:
         """Return the standard deviation of the position on the floor, where it is largest."""
         return float(np.sqrt(np.linalg.eigvalsh(self.covariance[:2, :2])[-1]))
@@ -99,14 +104,6 @@ class _Piece:
         self.begun_ns = begun_ns
         self.fixes: list[Fix] = []  # also those of a place that was withdrawn
         self.T_map_run: Transform | None = None  # None until it was located, or where withdrawn
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Guess:
-    """A place that one search found."""
-
-    T_map_run: Transform
-    fix: Fix
 
 
 class MapLocalizer:
@@ -132,7 +129,7 @@ class MapLocalizer:
         self._next_walls_ns = self._next_view_ns = 0
         self._seen: Look | None = None  # that was compared last
         self._travelled = np.zeros(2)  # until then: m, rad
-        self._guess: _Guess | None = None  # of the last search that found a place
+        self._guess: Fix | None = None  # of the last search that found a place
         self._vain = self._doubts = 0
 
     def is_due(self, newest: Look) -> bool:
@@ -194,19 +191,18 @@ class MapLocalizer:
             fix = self._by_walls(latest)
         if fix is None:
             return LocalizationEvent.NOTHING
-        T_map_run = fix.T_map_base @ se3.inverse(newest.T_run_base)
-        before, self._guess = self._guess, _Guess(T_map_run=T_map_run, fix=fix)
-        if before is None or not _agree(before.T_map_run, T_map_run, newest.T_run_base):
+        before, self._guess = self._guess, fix
+        if before is None or not _agree(before, fix):
             return LocalizationEvent.NOTHING
-        fix = self._with_walls(_mean(fix, before, newest), latest)
+        fix = self._with_walls(_mean(fix, before), latest)
         if fix is None:
             return LocalizationEvent.NOTHING
         if piece.fixes:  # it was located before: there, and it drifted, or somewhere else
             last = piece.fixes[-1]
-            T_expected = last.T_map_base @ se3.inverse(last.T_run_base) @ newest.T_run_base
+            T_expected = last.T_map_run @ newest.T_run_base
             if not _is_within(fix, self._window(T_expected, last.held)):
                 piece.fixes = []
-        self._take(newest, fix)
+        self._take(fix)
         return LocalizationEvent.FOUND
 
     def rewind(self, stamp_ns: int, path: Path) -> None:
@@ -222,11 +218,11 @@ class MapLocalizer:
         fix = piece.fixes[-1] if piece.fixes else None
         T_run_base = None if fix is None else path(fix.stamp_ns)
         if fix is not None and T_run_base is not None:
-            piece.fixes[-1] = replace(fix, T_run_base=T_run_base)
+            piece.fixes[-1] = fix = replace(fix, T_run_base=T_run_base)
             self._seen = Look(stamp_ns=fix.stamp_ns, T_run_base=T_run_base)
             self._travelled = fix.travelled
             if piece.T_map_run is not None:
-                piece.T_map_run = fix.T_map_base @ se3.inverse(T_run_base)
+                piece.T_map_run = fix.T_map_run
 
     def _is_time(self, newest: Look, next_ns: int) -> bool:
         """Tell whether the time has come, and a located robot has moved since its last fix."""
@@ -270,7 +266,7 @@ class MapLocalizer:
         period_s = _PERIOD_S * 2.0 ** min(self._vain // _PATIENCE, _DOUBLINGS)
         self._next_walls_ns = newest.stamp_ns + round(period_s * 1e9)
         if match is None:
-            if self._guess is not None and not self._guess.fix.is_by_view:
+            if self._guess is not None and not self._guess.is_by_view:
                 self._guess = None  # two searches by walls have to agree in a row
             return None
         return self._fix(newest, newest.T_run_base, match)
@@ -297,7 +293,7 @@ class MapLocalizer:
             is_contradicted |= are_refuted
             fix = by_walls if fix is None else _joint(by_walls, fix)
         if fix is not None:
-            self._take(newest, fix)
+            self._take(fix)
             return LocalizationEvent.FIXED
         self._doubts = self._doubts + 1 if is_contradicted else 0
         if self._doubts < _DOUBTS:
@@ -354,14 +350,14 @@ class MapLocalizer:
             covariance=on_floor(match.covariance),
         )
 
-    def _take(self, newest: Look, fix: Fix) -> None:
+    def _take(self, fix: Fix) -> None:
         piece = self._piece
-        piece.T_map_run = fix.T_map_base @ se3.inverse(newest.T_run_base)
+        piece.T_map_run = fix.T_map_run
         held = piece.fixes[-1].held if fix.is_open and piece.fixes else self._travelled
         fix = replace(fix, travelled=self._travelled, held=held, piece_ns=piece.begun_ns)
         piece.fixes.append(fix)
         self._doubts = self._vain = 0
-        self._next_walls_ns = self._next_view_ns = newest.stamp_ns + _FIX_NS
+        self._next_walls_ns = self._next_view_ns = fix.stamp_ns + _FIX_NS
 
 
 def _fix_of(seen: Sighting | None, newest: Look, T_base_cam: Transform) -> Fix | None:
@@ -406,17 +402,17 @@ def _query(latest: Sequence[Look]) -> FloorPlan:
     return draw(scans)
 
 
-def _agree(first: Transform, second: Transform, T_run_base: Transform) -> bool:
-    """Tell whether two estimates of T_map_run put the robot in the same place."""
-    off = se3.inverse(first @ T_run_base) @ second @ T_run_base
+def _agree(before: Fix, fix: Fix) -> bool:
+    """Tell whether an earlier fix puts the robot in the same place, carried on by the run."""
+    off = se3.inverse(before.T_map_run @ fix.T_run_base) @ fix.T_map_base
     return se3.is_within(off, _AGREE_M, _AGREE_RAD)
 
 
-def _mean(fix: Fix, before: _Guess, newest: Look) -> Fix:
+def _mean(fix: Fix, before: Fix) -> Fix:
     """Return the mean of the newest pose and that of an earlier search, carried on by the run."""
-    T_before = before.T_map_run @ newest.T_run_base
-    T_then_now = se3.inverse(before.fix.T_map_base) @ T_before
-    carried = se3.carried(before.fix.covariance, se3.inverse(T_then_now))
+    T_before = before.T_map_run @ fix.T_run_base
+    T_then_now = se3.inverse(before.T_map_base) @ T_before
+    carried = se3.carried(before.covariance, se3.inverse(T_then_now))
     mean, covariance = se3.mean([fix.T_map_base, T_before], [fix.covariance, carried])
     return replace(fix, T_map_base=mean, covariance=covariance)
 
