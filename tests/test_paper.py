@@ -43,13 +43,19 @@ def darkening():
     return [*votes, first, dark]
 
 
-QUIET = {"switches": [], "false_switches": 0, "detector_us": {"median": 40.0, "p95": 900.0}}
+QUIET = {
+    "switches": [],
+    "false_switches": 0,
+    "detection": {"missed": 1},
+    "detector_us": {"median": 40.0, "p95": 900.0},
+}
 
 
 def test_detection_tells_when_a_change_was_confirmed_and_what_the_grey_was(tmp_path, monkeypatch):
     metrics = {
         "switches": [{"stamp_ns": CONFIRMED_NS, "scene": "Dark", "confirm_delay_s": 2.1}],
         "false_switches": 0,
+        "detection": {"missed": 0},
         "detector_us": {"median": 40.0, "p95": 16_000.0},
     }
     told = Told(metrics=metrics, events=darkening())
@@ -61,7 +67,7 @@ def test_detection_tells_when_a_change_was_confirmed_and_what_the_grey_was(tmp_p
     verdict = experiment.run(teller(tmp_path / "runs", lambda trial: told), tmp_path)
     assert verdict.table.rows == [("Bright -> Dark", 3.0, 5.0, 2.1, 130.0, 30.0, 12.0)]
     assert shown == [DARK_NS - 2 * 10**9, CONFIRMED_NS]
-    assert [figure.holds for figure in verdict.figures] == [True, True, True, False]
+    assert [figure.holds for figure in verdict.figures] == [True, True, True, True, False]
 
 
 def test_without_a_change_there_is_no_picture_of_its_images(tmp_path, monkeypatch):
@@ -72,6 +78,7 @@ def test_without_a_change_there_is_no_picture_of_its_images(tmp_path, monkeypatc
     )
     verdict = experiment.run(teller(tmp_path / "runs", lambda trial: told), tmp_path)
     assert verdict.table.rows == [] and list(verdict.pictures) == ["grey_mean.png"]
+    assert [figure.name for figure in verdict.figures if not figure.holds] == ["changes missed"]
 
 
 def test_a_module_answers_for_the_light_it_is_meant_for_only(tmp_path, monkeypatch):

@@ -58,6 +58,8 @@ class DetectionExperiment:
             delay_s = number(switch["confirm_delay_s"])
             name = f"{switch['scene']} confirmed after the true change"
             yield Figure.at_most(name, delay_s, self._window_s + self._late_max_s, "s")
+        missed = number(outcome.metrics["detection"]["missed"])
+        yield Figure.at_most("changes missed", missed, 0.0)
         yield Figure.at_most("false switches", number(outcome.metrics["false_switches"]), 0.0)
         for share in ("median", "p95"):
             value_ms = number(cost_us[share]) / 1e3
