@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -25,13 +26,35 @@ from sceneslam.sources.simulator.robot.motion import (
     plan,
 )
 from sceneslam.sources.simulator.robot.wheels import SimulatedGyro, WheelOdometry
-from sceneslam.sources.simulator.settings import CameraSettings, GyroSettings, OdometrySettings
-from sceneslam.sources.simulator.shot import build_place, floor_plan, light_place
+from sceneslam.sources.simulator.settings import (
+    CameraSettings,
+    ExposureSettings,
+    GyroSettings,
+    OdometrySettings,
+)
+from sceneslam.sources.simulator.shot import Shot, build_place, floor_plan, light_place, meter
 from sceneslam.sources.simulator.stories import STORIES
 from sceneslam.sources.simulator.truth import changes_of, scene_at
 from sceneslam.types import se3
 
 _RATE_HZ = 10.0
+_CAMERA = CameraSettings(
+    size_wh=(48, 36),
+    fov_deg=57.0,
+    rate_hz=_RATE_HZ,
+    depth_range_m=(0.4, 4.5),
+    height_m=0.45,
+    forward_m=0.0,
+    tilt_deg=3.0,
+).camera()
+_EXPOSURE = ExposureSettings(
+    is_automatic=True,
+    target_grey=120.0,
+    lag_s=0.4,
+    nominal_s=0.01,
+    range_s=(0.0001, 0.02),
+    gain_max=1.0,
+)
 _CHANGES = {
     "bright_to_dark": ["Bright", "Dark"],
     "dark_to_bright": ["Dark", "Bright"],
@@ -63,21 +86,12 @@ def light_of(kind: str) -> LightMap:
 def greys_of(story: str, lights: str = "story") -> np.ndarray:
     """Return the true grey means at a low rate, by a small camera."""
     kind = STORIES[story].place
-    camera = CameraSettings(
-        size_wh=(48, 36),
-        fov_deg=57.0,
-        rate_hz=_RATE_HZ,
-        depth_range_m=(0.4, 4.5),
-        height_m=0.45,
-        forward_m=0.0,
-        tilt_deg=3.0,
-    ).camera()
-    eye = CameraRenderer(place_of(kind), light_of(kind), RayCaster(place_of(kind).panels), camera)
+    eye = CameraRenderer(place_of(kind), light_of(kind), RayCaster(place_of(kind).panels), _CAMERA)
     path = path_of(story)
     greys = []
     for time_s in np.arange(0.0, path.duration_s, 1.0 / _RATE_HZ).tolist():
         levels = STORIES[story].levels(place_of(kind).groups, time_s, lights)
-        seen = eye.look(path.pose(time_s) @ camera.T_base_cam, levels).image_bgr
+        seen = eye.look(path.pose(time_s) @ _CAMERA.T_base_cam, levels).image_bgr
         image = np.minimum(seen, 255.0)
         greys.append(float((image @ [0.114, 0.587, 0.299]).mean()))
     return np.array(greys)
@@ -225,6 +239,26 @@ def test_flicker_never_lasts_a_second() -> None:
     assert len(off) >= 4
     assert off.min() >= 0.1
     assert off.max() < 1.0
+
+
+def test_each_frame_is_metered_in_its_own_light() -> None:
+    place = replace(place_of("two_rooms"), cell_m=0.6)
+    shot = Shot(
+        story=STORIES["flicker"],
+        lights="story",
+        seed=0,
+        path=path_of("flicker"),
+        rate_hz=_RATE_HZ,
+        camera=_CAMERA,
+        scanner=None,
+        place=place,
+        light=light_place(place, seed=0),
+        exposure=_EXPOSURE,
+        exposures=np.ones(60),
+    )
+    means = [float(grey.mean()) for grey in meter(shot, 60)]
+    dark = [index for index, mean in enumerate(means) if mean < 60.0]
+    assert dark == [41, 42]  # the lamp fails from 4.0 to 4.3 s
 
 
 def changes(scenes: list[str]) -> list[tuple[float, str]]:

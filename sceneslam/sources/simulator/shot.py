@@ -23,7 +23,6 @@ from sceneslam.sources.simulator.story import Story
 from sceneslam.types.rig import Camera
 from sceneslam.types.se3 import Transform
 
-_METERED = 64  # frames metered together, in the light of the first
 _PLACE_STREAM, _FRAME_STREAM, _SWEEP_STREAM = 1, 2, 3  # streams of random numbers
 
 
@@ -128,14 +127,13 @@ class Photographer:
 
 
 def meter(shot: Shot, count: int) -> list[NDArray[np.float32]]:
-    """Return the grey values of a coarse pixel grid (N,) of each frame, before exposure."""
+    """Return the grey values of a coarse pixel grid (N,) of each frame, in its own light."""
     eye = CameraRenderer(shot.place, shot.light, RayCaster(shot.place.panels), shot.camera)
+    step_px = max(1, shot.camera.size_wh[0] // 32)
     greys: list[NDArray[np.float32]] = []
-    for first in range(0, count, _METERED):
-        times_s = [shot.time_s(index) for index in range(first, min(first + _METERED, count))]
-        poses = [shot.path.pose(time_s) @ shot.camera.T_base_cam for time_s in times_s]
-        levels = shot.levels(times_s[0])
-        greys += eye.meter(poses, levels, max(1, shot.camera.size_wh[0] // 32))
+    for time_s in map(shot.time_s, range(count)):
+        T_gt_cam = shot.path.pose(time_s) @ shot.camera.T_base_cam
+        greys.append(eye.meter(T_gt_cam, shot.levels(time_s), step_px))
     return greys
 
 

@@ -6,7 +6,7 @@ different panels. Depth and texture coordinates then follow exactly from the pan
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import cv2
@@ -83,20 +83,13 @@ class CameraRenderer:
             blinded=blinded,
         )
 
-    def meter(
-        self, poses: Sequence[Transform], levels: Mapping[str, float], step_px: int
-    ) -> list[Image]:
-        """Return the grey values (N,), 0 to 255, of every `step_px`-th pixel from each T_gt_cam."""
+    def meter(self, T_gt_cam: Transform, levels: Mapping[str, float], step_px: int) -> Image:
+        """Return the grey values (N,), 0 to 255, of every `step_px`-th pixel."""
         directions = np.ascontiguousarray(self._directions[::step_px, ::step_px])
         lengths = np.ascontiguousarray(self._lengths[::step_px, ::step_px])
-        weights = np.array([0.114, 0.587, 0.299], np.float32)
-        greys = []
-        for T_gt_cam in poses:
-            panels = self._cast(T_gt_cam, directions)
-            sight = self._planes.seen_from(T_gt_cam)
-            image = self._shade(sight, panels, directions, lengths, levels).image_bgr
-            greys.append((image @ weights).ravel())
-        return greys
+        panels, sight = self._cast(T_gt_cam, directions), self._planes.seen_from(T_gt_cam)
+        image = self._shade(sight, panels, directions, lengths, levels).image_bgr
+        return np.asarray(image @ np.array([0.114, 0.587, 0.299], np.float32)).ravel()
 
     def _cast(self, T_gt_cam: Transform, directions_cam: Image) -> Panels:
         rays = _rays(T_gt_cam, directions_cam)
