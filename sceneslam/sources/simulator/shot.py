@@ -96,7 +96,10 @@ class Photographer:
         add_people(view, shot.place.people, time_s, T_gt_cam, rays, shot.levels(time_s))
 
     def _shutter(self, index: int) -> Shutter:
-        """Return a frame's exposure; motion blur is due to rotation only, as driving is slow."""
+        """Return a frame's exposure; a fixed one is as sharp as an instant.
+
+        Motion blur of an automatic one is due to rotation only, as driving is slow.
+        """
         shot, settings = self._shot, self._shot.exposure
         if not settings.is_automatic:
             return Shutter()
@@ -127,7 +130,7 @@ class Photographer:
 
 
 def meter(shot: Shot, count: int) -> list[NDArray[np.float32]]:
-    """Return the grey values of a coarse pixel grid (N,) of each frame, in its own light."""
+    """Return the grey values of a coarse pixel grid (N,) of each frame, before exposure."""
     eye = CameraRenderer(shot.place, shot.light, RayCaster(shot.place.panels), shot.camera)
     step_px = max(1, shot.camera.size_wh[0] // 32)
     greys: list[NDArray[np.float32]] = []
