@@ -14,6 +14,7 @@ from omegaconf import OmegaConf
 from ros_recordings import _source_config as make_config
 from told_runs import Told, teller
 
+from sceneslam.evaluation.association import select
 from sceneslam.experiments.paper import alone, detection
 from sceneslam.experiments.paper.alone import AloneExperiment
 from sceneslam.experiments.paper.detection import DetectionExperiment
@@ -209,19 +210,33 @@ def test_images_and_rooms_are_drawn_from_the_runs_own_recording(folder):
         assert (folder / name).stat().st_size > 10_000, name
 
 
+def difference(tmp_path, switched, unswitched):
+    """Return the verdict on two runs over 50 observations; 0.03 m are allowed."""
+    metrics = {"ate_rmse_m": 0.01, "association_gap_s": 0.01, "observations": 50}
+
+    def tell(trial):
+        trajectory = unswitched if trial.name.endswith("unswitched") else switched
+        return Told(metrics=metrics, trajectory=trajectory)
+
+    experiment = DifferenceExperiment(lit_module="bright", difference_max_m={"one": 0.03})
+    return experiment.run(teller(tmp_path / "runs", tell), tmp_path)
+
+
 @pytest.mark.parametrize(("offset_m", "holds"), [(0.02, True), (0.04, False)])
 def test_difference_is_the_largest_between_the_two_runs(tmp_path, offset_m, holds):
     path = loop(50)
     aside = moved(path, se3.from_parts(np.eye(3), np.array([0.0, offset_m, 0.0])))
-
-    def tell(trial):
-        trajectory = aside if trial.name.endswith("unswitched") else path
-        return Told(metrics={"ate_rmse_m": 0.01, "association_gap_s": 0.01}, trajectory=trajectory)
-
-    experiment = DifferenceExperiment(lit_module="bright", difference_max_m={"one": 0.03})
-    verdict = experiment.run(teller(tmp_path / "runs", tell), tmp_path)
-    assert verdict.figures[0].value == pytest.approx(offset_m) and verdict.holds is holds
+    verdict = difference(tmp_path, path, aside)
+    assert verdict.figures[1].value == pytest.approx(offset_m) and verdict.holds is holds
     assert (tmp_path / "difference.png").stat().st_size > 5000
+
+
+def test_two_runs_are_compared_over_the_whole_path(tmp_path):
+    verdict = difference(tmp_path, select(loop(50), np.arange(20)), loop(50))
+    assert [(figure.value, figure.holds) for figure in verdict.figures] == [
+        (0.4, False),
+        (0.0, True),
+    ]
 
 
 def test_startup_is_timed_in_a_fresh_process_and_switches_by_the_log(tmp_path, monkeypatch):
