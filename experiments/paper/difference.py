@@ -76,7 +76,7 @@ def _elapsed_s(one: Difference) -> NDArray[np.float64]:
 
 def _share(one: Difference, run: TrialResult) -> float:
     """Return the share of a run's observations at which both runs have a pose."""
-    return len(one.stamps_ns) / max(1.0, number(run.metrics["observations"]))
+    return len(one.stamps_ns) / max(1.0, float(run.metrics["observations"]))
 
 
 def _row(
