@@ -2,6 +2,7 @@
 
 import hashlib
 import io
+import zipfile
 from concurrent.futures import Future
 from dataclasses import replace
 
@@ -53,6 +54,8 @@ def test_a_map_is_loaded_as_it_was_saved(tmp_path):
     head = yaml.safe_load((tmp_path / HEAD).read_text())
     assert [head[key] for key in ("submaps", "edges", "runs", "pieces")] == [2, 1, 2, 2]
     assert head["modules"] == ["a", "b"] and head["cell_m"] == CELL
+    with zipfile.ZipFile(tmp_path / head["arrays"]) as file:  # its bytes hold no time
+        assert {entry.date_time for entry in file.infolist()} == {(1980, 1, 1, 0, 0, 0)}
     for one, other in zip(found.submaps, saved.submaps, strict=True):
         assert (one.run, one.session, one.module) == (other.run, other.session, other.module)
         np.testing.assert_array_equal(one.stamps_ns, other.stamps_ns)

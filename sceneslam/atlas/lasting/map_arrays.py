@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -102,12 +101,8 @@ def arrays_of(saved: SavedMap, modules: list[str]) -> dict[str, NDArray[Any]]:
 def packed(arrays: Mapping[str, NDArray[Any]]) -> bytes:
     """Return an npz whose bytes depend on the arrays alone, not on the time."""
     buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as file:
-        for name, array in arrays.items():
-            part = io.BytesIO()
-            np.lib.format.write_array(part, np.ascontiguousarray(array), allow_pickle=False)
-            entry = zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0))
-            file.writestr(entry, part.getvalue(), zipfile.ZIP_DEFLATED, 6)
+    rows = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+    np.savez_compressed(buffer, allow_pickle=False, **rows)
     return buffer.getvalue()
 
 
