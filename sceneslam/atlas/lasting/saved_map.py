@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import compress
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -227,7 +228,9 @@ def forget_contradicted(saved: SavedMap, run: int) -> SavedMap:
 def _without(plan: FloorPlan, T_today_plan: planar.Planar, today: FloorPlan) -> FloorPlan:
     """Return a plan without what `today`, in which it lies at T_today_plan, contradicts."""
     points = planar.apply(T_today_plan, plan.points.astype(np.float64))
-    kept = ~_clear(today, points)
+    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+    inner = cv2.erode(today.free.astype(np.uint8), cross) > 0  # with free cells on all sides
+    kept = ~replace(today, free=inner).is_free(points)
     free = plan.free.copy()
     walls = planar.apply(planar.between(T_today_plan, np.zeros(3)), today.points.astype(np.float64))
     cells = plan.cells(walls)
@@ -235,13 +238,3 @@ def _without(plan: FloorPlan, T_today_plan: planar.Planar, today: FloorPlan) -> 
     inside = ((cells >= 0) & (cells < [columns, rows])).all(axis=1)
     free[cells[inside, 1], cells[inside, 0]] = False
     return replace(plan, points=plan.points[kept], normals=plan.normals[kept], free=free)
-
-
-def _clear(plan: FloorPlan, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Tell which points (N, 2) lie in free cells of a plan, with free cells all around."""
-    free = np.pad(plan.free, 2)
-    inner = free.copy()
-    for axis in (0, 1):
-        inner &= np.roll(free, 1, axis) & np.roll(free, -1, axis)
-    cells = np.clip(plan.cells(points) + 2, 0, [free.shape[1] - 1, free.shape[0] - 1])
-    return np.asarray(inner[cells[:, 1], cells[:, 0]])
