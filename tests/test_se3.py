@@ -57,6 +57,14 @@ def test_interpolation_ends_at_its_ends(T_w_0, ratio):
     np.testing.assert_allclose(half, 0.8 * ratio, atol=1e-9)
 
 
+@given(twists, twists, st.floats(0.0, 1.0))
+def test_a_stack_is_interpolated_as_its_poses(T_w_0, T_w_1, ratio):
+    first, second = np.stack([T_w_0, T_w_1]), np.stack([T_w_1, T_w_1])
+    shares = np.array([ratio, 1.0 - ratio])
+    expected = [se3.interpolate(*one) for one in zip(first, second, shares, strict=True)]
+    np.testing.assert_allclose(se3.interpolate(first, second, shares), expected, atol=1e-9)
+
+
 @given(st.floats(-3.1, 3.1))
 def test_yaw_of_a_planar_motion_is_its_yaw(yaw):
     T_a_b = se3.from_xy_yaw(1.0, 2.0, yaw)

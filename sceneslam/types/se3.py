@@ -100,13 +100,10 @@ def hat(v: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def so3_exp(rotvec_rad: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the (3, 3) rotation by the vector (3,) [rad] (Rodrigues)."""
-    angle = float(np.linalg.norm(rotvec_rad))
+    """Return the (..., 3, 3) rotations by the vectors (..., 3) [rad] (Rodrigues)."""
+    angle = np.maximum(np.linalg.norm(rotvec_rad, axis=-1), 1e-8)[..., None, None]
     k = hat(rotvec_rad)
-    if angle < 1e-8:
-        return np.eye(3) + k + 0.5 * k @ k
-    a = np.sin(angle) / angle
-    b = (1.0 - np.cos(angle)) / angle**2
+    a, b = np.sin(angle) / angle, (1.0 - np.cos(angle)) / angle**2
     return np.asarray(np.eye(3) + a * k + b * k @ k)
 
 
@@ -176,11 +173,14 @@ def mean(
     return T_a_b[0] @ exp(spread @ np.einsum("nij,nj->i", weights, offs)), len(T_a_b) * spread
 
 
-def interpolate(T_w_0: Transform, T_w_1: Transform, ratio: float) -> Transform:
-    """Return the pose (4, 4) at `ratio` between T_w_0 and T_w_1 (linear, slerp)."""
-    step = so3_log(T_w_0[:3, :3].T @ T_w_1[:3, :3])
-    rotation = T_w_0[:3, :3] @ so3_exp(ratio * step)
-    return from_parts(rotation, (1.0 - ratio) * T_w_0[:3, 3] + ratio * T_w_1[:3, 3])
+def interpolate(
+    T_w_0: Transform, T_w_1: Transform, ratio: float | NDArray[np.float64]
+) -> Transform:
+    """Return the poses (..., 4, 4) at `ratio` (...) between T_w_0 and T_w_1 (linear, slerp)."""
+    share, R_w_0 = np.asarray(ratio)[..., None], T_w_0[..., :3, :3]
+    step = so3_log(np.swapaxes(R_w_0, -1, -2) @ T_w_1[..., :3, :3])
+    shift_m = (1.0 - share) * T_w_0[..., :3, 3] + share * T_w_1[..., :3, 3]
+    return from_parts(R_w_0 @ so3_exp(share * step), shift_m)
 
 
 def from_quat_xyzw(translation_m: NDArray[np.float64], quat_xyzw: NDArray[np.float64]) -> Transform:

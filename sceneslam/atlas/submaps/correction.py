@@ -66,10 +66,5 @@ class Correction:
         before = np.maximum(after - 1, 0)
         span_ns = np.maximum(self.stamps_ns[after] - self.stamps_ns[before], 1)
         shares = np.clip((stamps_ns - self.stamps_ns[before]) / span_ns, 0.0, 1.0)
-        moved = np.array(T_map_base)
-        for row, share in enumerate(shares.tolist()):
-            first, second = (
-                self.T_new_old[node[row]] @ T_map_base[row] for node in (before, after)
-            )
-            moved[row] = se3.interpolate(first, second, share)
-        return moved
+        first, second = (self.T_new_old[nodes] @ T_map_base for nodes in (before, after))
+        return se3.interpolate(first, second, shares)
