@@ -27,11 +27,10 @@ from sceneslam.atlas.lasting.map_files import (
 from sceneslam.atlas.lasting.saved_map import empty_map
 from sceneslam.config.component import ComponentBuilder
 from sceneslam.graphs.edge import EdgeKind
-from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.files import MARK, owned
 from sceneslam.types.rig import optical_to_rep103
-from sceneslam.views.view import PlacedView, depth_noise_m
+from sceneslam.views.view import PlacedView
 
 ATLAS = "sceneslam.atlas.atlas.Atlas"
 
@@ -125,8 +124,8 @@ def test_arrays_that_do_not_fit_together_are_named(tmp_path, name, value, said):
 @pytest.mark.parametrize(
     ("key", "value", "said"),
     [
-        ("version", 0, "a map of version 0, only versions 2 to 5 are known"),
-        ("version", "3", "a map of version '3', only versions 2 to 5 are known"),
+        ("version", 4, "a map of version 4, only version 5 is read"),
+        ("version", "3", "a map of version '3', only version 5 is read"),
         ("version", 6, "a map of version 6, a newer SceneSLAM wrote it"),
         ("sha256", None, "sha256: missing, the map's map.yaml is not complete"),
         ("cell_m", 0.1, "cell_m: got 0.1, allowed: 0.05"),
@@ -144,44 +143,6 @@ def test_a_head_that_does_not_fit_is_named(tmp_path, key, value, said):
         load_map_files(path.parent)
     with pytest.raises(InputError, match="there is no map, the folder is missing"):
         load_map_files(tmp_path / "none")
-
-
-@pytest.mark.parametrize(
-    ("version", "lacks"),
-    [(2, {"node_up", "landmark_deviation"}), (3, {"landmark_deviation"}), (4, set())],
-)
-def test_a_map_of_an_older_version_is_loaded(tmp_path, version, lacks):
-    """It does not know what is up, a depth camera measured all landmarks, and base saw them."""
-    with_arrays(tmp_path, lambda arrays: [arrays.pop(name) for name in lacks])
-    head = (tmp_path / HEAD).read_text()
-    (tmp_path / HEAD).write_text(head.replace(f"version: {VERSION}", f"version: {version}"))
-    loaded, saved = load_map_files(tmp_path).submaps, whole_map().submaps
-    for one, was in zip(loaded, saved, strict=True):
-        assert (one.up is None) == (was.up is None or "node_up" in lacks)
-        for view, seen in zip(one.views, was.views, strict=True):
-            far_m = np.linalg.norm(seen.landmarks.points_cam, axis=1)
-            noise_m = seen.landmarks.deviation_m if version == 4 else depth_noise_m(far_m)
-            np.testing.assert_allclose(view.landmarks.deviation_m, noise_m, rtol=1e-6)
-            T_base_cam = optical_to_rep103()
-            np.testing.assert_array_equal(view.T_submap_cam, seen.T_submap_cam @ T_base_cam)
-            points, before = (
-                se3.apply(T, one.landmarks.points_cam.astype(float))
-                for T, one in ((view.T_submap_cam, view), (seen.T_submap_cam, seen))
-            )
-            np.testing.assert_allclose(points, before, atol=1e-6)
-    assert any(submap.views for submap in loaded)
-
-
-def test_an_older_map_with_odd_landmarks_is_named_as_a_newer_one(tmp_path):
-    def harm(arrays):
-        arrays.pop("landmark_deviation")
-        arrays["landmark"] = np.full((5, 3), "a")
-
-    with_arrays(tmp_path, harm)
-    head = (tmp_path / HEAD).read_text()
-    (tmp_path / HEAD).write_text(head.replace(f"version: {VERSION}", "version: 3"))
-    with pytest.raises(InputError, match="landmark: expected"):
-        load_map_files(tmp_path)
 
 
 @pytest.mark.parametrize(

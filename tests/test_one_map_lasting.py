@@ -220,7 +220,7 @@ def damaged(folder, tmp_path, harm):
             f"version {VERSION + 1}, a newer SceneSLAM wrote it",
         ),
         (
-            lambda f, a: (f / HEAD).write_text("format: sceneslam-map\nversion: 2\n"),
+            lambda f, a: (f / HEAD).write_text(f"format: sceneslam-map\nversion: {VERSION}\n"),
             "arrays: missing, the map's map.yaml is not complete",
         ),
     ],

@@ -16,8 +16,7 @@ from sceneslam.atlas.submaps.submap import Drawing, Submap
 from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.types import se3
 from sceneslam.types.errors import InputError
-from sceneslam.types.rig import optical_to_rep103
-from sceneslam.views.view import Landmarks, PlacedView, depth_noise_m
+from sceneslam.views.view import Landmarks, PlacedView
 
 _FAR_M = 1e5  # no building is so large
 _ROUNDING = 1e-6  # of a rotation that was composed of many
@@ -104,29 +103,6 @@ def packed(arrays: Mapping[str, NDArray[Any]]) -> bytes:
     rows = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
     np.savez_compressed(buffer, allow_pickle=False, **rows)
     return buffer.getvalue()
-
-
-def lacking(arrays: Mapping[str, NDArray[Any]], version: int) -> dict[str, NDArray[Any]]:
-    """Return what an older version lacks, as far as its other arrays are what they should be."""
-    added = dict[str, NDArray[Any]]()
-    if version < 3:
-        added["node_up"] = np.zeros((np.size(arrays.get("node_run", ())), 3))
-    landmark = arrays.get("landmark")
-    if version < 4 and landmark is not None:  # a depth camera measured all of them
-        is_sound = landmark.dtype == np.float32 and landmark.shape[1:] == (3,)
-        far_m = np.linalg.norm(landmark.astype(float), axis=1) if is_sound else np.zeros(0)
-        added["landmark_deviation"] = depth_noise_m(far_m).astype(np.float32)
-    return added
-
-
-def seen_ahead(arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """Return the views of versions before 5: poses and landmarks were in base.
-
-    Where the camera was mounted is not known; it is taken as if it looked ahead from there.
-    """
-    T_base_cam = optical_to_rep103()
-    landmark = se3.apply(se3.inverse(T_base_cam), arrays["landmark"])
-    return {"view_pose": arrays["view_pose"] @ T_base_cam, "landmark": landmark.astype(np.float32)}
 
 
 def check_arrays(arrays: Mapping[str, NDArray[Any]], path: Path) -> None:

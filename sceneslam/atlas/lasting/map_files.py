@@ -21,22 +21,13 @@ from typing import Any
 import numpy as np
 import yaml
 
-from sceneslam.atlas.lasting.map_arrays import (
-    arrays_of,
-    check_arrays,
-    lacking,
-    map_of,
-    packed,
-    seen_ahead,
-)
+from sceneslam.atlas.lasting.map_arrays import arrays_of, check_arrays, map_of, packed
 from sceneslam.atlas.lasting.saved_map import SavedMap
 from sceneslam.atlas.places.floor_plan import CELL_M
 from sceneslam.types.errors import InputError, text_of
 from sceneslam.types.files import PART, whole
 
 HEAD, FORMAT, VERSION = "map.yaml", "sceneslam-map", 5
-_OLDEST = 2  # that is read: without `node_up`; before 4 without `landmark_deviation`
-_IN_BASE = 4  # the last one whose views are in axes of base
 OLD = "map.old.yaml"  # the head of a map that another one took the place of
 _ARRAYS = "arrays-"  # prefix, followed by the start of their checksum
 
@@ -166,10 +157,7 @@ def read_map_files(folder: Path) -> tuple[SavedMap, str]:
             arrays = {name: file[name] for name in file.files}
     except (ValueError, OSError, EOFError, zipfile.BadZipFile, KeyError) as error:
         raise InputError(f"the map's arrays cannot be read ({text_of(error)}): {path}") from error
-    arrays = lacking(arrays, head["version"]) | arrays
     check_arrays(arrays, path)
-    if head["version"] <= _IN_BASE:
-        arrays |= seen_ahead(arrays)
     modules = head.get("modules")
     if not isinstance(modules, list) or arrays["node_module"].max(initial=-1) >= len(modules):
         raise InputError(f"modules: expected the names that the submaps refer to: {folder / HEAD}")
@@ -203,10 +191,9 @@ def _read_head(folder: Path) -> dict[str, Any]:
     if not isinstance(head, dict) or head.get("format") != FORMAT:
         raise InputError(f"not a map of SceneSLAM (format: {FORMAT} is missing): {path}")
     version = head.get("version")
-    if version not in range(_OLDEST, VERSION + 1):
+    if version != VERSION:
         newer = isinstance(version, int) and version > VERSION
-        which = f"only versions {_OLDEST} to {VERSION} are known"
-        which = "a newer SceneSLAM wrote it" if newer else which
+        which = "a newer SceneSLAM wrote it" if newer else f"only version {VERSION} is read"
         raise InputError(f"a map of version {version!r}, {which}: {path}")
     for key in ("arrays", "sha256"):
         if not isinstance(head.get(key), str):
