@@ -21,7 +21,7 @@ class Told:
 
     def __init__(self):
         self.x_m, self.fixes, self.piece_ns, self.pieces_ns = None, [], 0, [0]
-        self.rewound = []
+        self.rewound, self.is_withdrawn = [], False
 
     @property
     def is_located(self):
@@ -35,6 +35,9 @@ class Told:
         return True
 
     def compare(self, latest):
+        if self.x_m is None and self.is_withdrawn:
+            self.is_withdrawn, self.fixes = False, []
+            return LocalizationEvent.WITHDRAWN
         if self.x_m is None:
             return LocalizationEvent.NOTHING
         event = LocalizationEvent.FIXED if self.is_located else LocalizationEvent.FOUND
@@ -72,12 +75,12 @@ def told():
     return Told()
 
 
-def searching(told, executor=None):
+def searching(told, executor=None, note=lambda *_, **__: None):
     return MapSearch(
         told,
         executor=executor or InStep(),
         path=lambda stamp_ns: se3.identity(),
-        note=lambda *_, **__: None,
+        note=note,
     )
 
 
@@ -132,6 +135,17 @@ def test_poses_that_are_replaced_lie_where_the_localizer_puts_them_then(told):
     search.collect(6 * S)
     assert told.rewound == [4 * S] and search.take_news()
     assert where(search, 0, 4) == [1.0, 9.0]
+
+
+def test_what_was_found_and_withdrawn_is_not_called_not_found(told):
+    noted = []
+    search = searching(told, note=lambda event, *_, **__: noted.append(event))
+    told.x_m = 1.0
+    search.look(look(1))
+    told.x_m, told.is_withdrawn = None, True
+    for second in (30, 61, 90):
+        search.look(look(second))
+    assert noted == ["relocalized", "relocalization_withdrawn"]
 
 
 def test_without_a_localizer_nothing_is_found():

@@ -141,7 +141,7 @@ def test_a_piece_begins_with_each_later_session_also_with_one_that_comes_again()
         T, of_map = at(0.1 * second), unknown_motion(5.0)
         known = Known(T_map_base=T, session=session, module="a", covariance=None, of_map=of_map)
         begun.append(own.has_begun(known))
-    assert begun == [False, False, True, True, False, False, True, False, False, True]
+    assert begun == [False, True, True, True, False, False, True, False, False, True]
 
 
 def test_a_rewind_to_before_the_run_leaves_nothing_until_poses_come():

@@ -21,7 +21,7 @@ from sceneslam.atlas.submaps.plan_loops import PlanLoops
 from sceneslam.atlas.submaps.run_graph import RunGraph
 from sceneslam.testing.room import RIG, observation_at
 from sceneslam.types import se3
-from sceneslam.types.maps import MapLayers
+from sceneslam.types.maps import GridLayer, MapLayers
 from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.run import BRIDGED
 from sceneslam.types.trajectory import Trajectory
@@ -260,6 +260,33 @@ def test_no_corner_is_located_across_a_jump_of_the_path(jump_m, is_located):
             view = taker.take(replace(look(index), depth_m=None))
             found = taker.locate(view, START_NS + index * STEP_NS, T_run_base)
     assert (found is not None) == is_located
+
+
+def seen_by_camera(indices, grid=None, **options):
+    """Return an atlas of a run whose camera has no depth; its module gives a grid."""
+    atlas = Atlas(voxel_m=0.05, **options)
+    sensors = frozenset({Sensor.IMAGE, Sensor.ODOMETRY})
+    atlas.open(replace(SEEING, sensors=sensors), lambda *_, **__: None)
+    atlas.begin_session("camera", np.eye(4))
+    for index in indices:
+        T = se3.inverse(true_pose(indices[0])) @ true_pose(index)
+        seen = replace(look(index), depth_m=None)
+        atlas.add_local(seen.stamp_ns, T)
+        atlas.add(seen.stamp_ns, T, "camera", np.eye(6) * 1e-6)
+        atlas.observe(seen, None)
+    atlas.close_session(0, MapLayers(grid=grid), Trajectory.empty())
+    assert not atlas.finish()
+    return atlas
+
+
+def test_a_run_that_is_found_by_views_alone_keeps_its_grid(tmp_path):
+    seen_by_camera(range(LAP), save=str(tmp_path / "map"))
+    own = GridLayer(log_odds=np.ones((8, 9), np.float32), resolution_m=0.05, origin_xy_m=(-2, -2))
+    for grid in (own, None):
+        atlas = seen_by_camera(range(40, 80), grid, load=str(tmp_path / "map"), mode="localize")
+        fused = atlas.fuse_maps().grid
+        assert atlas._mapper.is_placed and (fused is None) == (grid is None)
+        assert fused is None or fused.log_odds.any()
 
 
 def blind_taker():

@@ -336,7 +336,9 @@ class Atlas:
         if not self._mapper.is_placed:
             return fused
         try:
-            return replace(fused, grid=grid_of(self._lasting.map_of(self._mapper).plan()))
+            plan = self._lasting.map_of(self._mapper).plan()
+            is_drawn = len(plan) or plan.free.any()  # a map of views alone has no walls
+            return replace(fused, grid=grid_of(plan)) if is_drawn else fused
         except InputError as error:  # it is too large
             _log.warning("the grid is without the loaded map: %s", error)
             return fused

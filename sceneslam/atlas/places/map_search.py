@@ -152,7 +152,7 @@ class MapSearch:
             self._follow(localizer, localizer.fixes[-1].stamp_ns)
         elif outcome is LocalizationEvent.FOUND:
             self._follow(localizer, localizer.piece_ns)
-            self.was_found = True
+            self.was_found = self._has_told = True
             self._note(outcome.value, stamp_ns, after_s=after_s, T_map_run=self.T_map_run.tolist())
         elif outcome is LocalizationEvent.WITHDRAWN:
             self._follow(localizer, localizer.piece_ns)

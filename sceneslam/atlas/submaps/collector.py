@@ -70,7 +70,7 @@ class Collector:
         self._recent: list[list[KeyPose]] = []  # of the newest submaps, oldest first
         self._waiting: list[_Step] = []  # for their poses
         self._last: Transform | None = None  # pose of the last step
-        self._session = -1  # of the last pose
+        self._session: int | None = None  # of the last pose; -1: bridged, before the first
         self._up = np.zeros(3)  # of the base, the mean over the last steps
         self._level = self._count = 0
 
@@ -86,7 +86,7 @@ class Collector:
         piece goes on.
         """
         before, self._session = self._session, known.session
-        if before == -1 or known.session <= before:
+        if before is None or known.session <= before:
             return False
         first = self._known(known.begun_ns)
         return is_guessed((known if first is None else first).of_map)
