@@ -101,7 +101,7 @@ def packed(arrays: Mapping[str, NDArray[Any]]) -> bytes:
     """Return an npz whose bytes depend on the arrays alone, not on the time."""
     buffer = io.BytesIO()
     rows = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
-    np.savez_compressed(buffer, allow_pickle=False, **rows)
+    np.savez_compressed(buffer, **rows)
     return buffer.getvalue()
 
 
