@@ -15,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from networks import footage
 
+from sceneslam.modules.detectors.learned import Learned
 from sceneslam.scenes.__main__ import main
 from sceneslam.scenes.examples import Example, MeasuredExample
 from sceneslam.scenes.label import Labels, cheapest
@@ -255,18 +256,54 @@ def test_a_run_without_truth_and_covariances_is_one_sentence(tmp_path, capsys, i
     assert "neither ground truth nor covariances" in said and said.count("\n") == 1
 
 
-def test_labels_of_modules_that_are_equally_good_are_trained_on(tmp_path):
+def labelled(scene, values, weight, group=None):
+    """Return an example of one feature, whose images have a weight each."""
+    named = {"scene": scene, "group": group or scene, "name": scene}
+    count = len(values)
+    return MeasuredExample(
+        example=Example(**named, parts=[], config={}, is_weighted=True),
+        features=np.array(values)[:, None],
+        weights=np.full(count, weight),
+        thumbnails=[None] * count,
+    )
+
+
+def test_what_a_label_gains_is_no_likelihood(tmp_path):
     pytest.importorskip("sklearn", reason="the extra `learn` is not installed")
-    examples = [
-        MeasuredExample(
-            example=Example(
-                scene=scene, group=scene, name=scene, parts=[], config={}, is_weighted=True
-            ),
-            features=np.full((5, 1), value),
-            weights=np.zeros(5),
-            thumbnails=[None] * 5,
-        )
+    path, values = tmp_path / "model.yaml", [-1.0, 0.0, 1.0]  # they tell nothing of the scene
+    seen = [
+        labelled(scene, values, weight, group)
+        for group in ("a", "b")
+        for scene, weight in (("eyes", 5.0), ("laser", 1.0))
+    ]
+    train(seen, ["q50"]).model.write(path, [])
+    vote = Learned(str(path)).decide(0, np.array([0.5]))
+    assert vote.scene == "eyes" and vote.value == pytest.approx(5.0 / 6.0, abs=0.01)
+    assert vote.likelihoods["eyes"] == pytest.approx(0.5, abs=0.01)
+
+
+def test_a_scene_whose_labels_gain_nothing_has_finite_likelihoods(tmp_path):
+    pytest.importorskip("sklearn", reason="the extra `learn` is not installed")
+    path = tmp_path / "model.yaml"
+    seen = [labelled("eyes", [0.9, 1.1], 1.0), labelled("laser", [-0.9, -1.1], 0.0)]
+    train(seen, ["q50"]).model.write(path, [])
+    vote = Learned(str(path)).decide(0, np.array([1.0]))
+    assert vote.scene == "eyes" and sum(vote.likelihoods.values()) == pytest.approx(1.0)
+
+
+def test_a_label_that_gains_nothing_does_not_lower_the_certainty():
+    pytest.importorskip("sklearn", reason="the extra `learn` is not installed")
+    right = [
+        labelled(scene, [value] * 20, 1.0, group)
+        for group in ("a", "b")
         for scene, value in (("eyes", 1.0), ("laser", -1.0))
     ]
+    wrong = [labelled("eyes", [-1.0] * 20, 1e-6, group) for group in ("a", "b")]
+    assert train([*right, *wrong], ["q50"]).temperature == train(right, ["q50"]).temperature
+
+
+def test_labels_of_modules_that_are_equally_good_are_trained_on(tmp_path):
+    pytest.importorskip("sklearn", reason="the extra `learn` is not installed")
+    examples = [labelled("eyes", [1.0] * 5, 0.0), labelled("laser", [-1.0] * 5, 0.0)]
     model = train(examples, ["q50"]).model
     assert (np.argmax(model.scores(np.array([[1.0], [-1.0]])), axis=1) == [0, 1]).all()

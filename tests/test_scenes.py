@@ -123,7 +123,8 @@ def test_detector_votes_as_the_model_does_with_probabilities_that_sum_to_one(fol
             odds = np.log(vote.likelihoods["Bright"]) - np.log(vote.likelihoods["Dark"])
             at = [read.scenes.index(scene) for scene in ("Bright", "Dark")]
             assert odds == pytest.approx(scores[at[0]] - scores[at[1]], abs=1e-6)
-            assert vote.scene == folder[:-2] and vote.value == max(vote.likelihoods.values())
+            assert vote.scene == folder[:-2]
+            assert vote.value == pytest.approx(max(vote.likelihoods.values()))
     assert detector.get_scene(Observation(stamp_ns=1)).scene == UNSURE
 
 
@@ -274,6 +275,8 @@ def test_file_that_is_no_model_is_refused(tmp_path, text):
         ("features", ["q50", "q75"]),
         ("scale", [0.0, 1.0, 1.0, 1.0]),
         ("bias", {"Bright": float("nan"), "Dark": 0.0}),
+        ("prior", {"Bright": 1.0, "Dark": 0.0}),
+        ("prior", {"Bright": 1.0}),
         ("scenes", ["Dark", "Dark"]),
     ],
 )

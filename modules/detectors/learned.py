@@ -39,6 +39,7 @@ class Learned:
         # As one matrix and one offset.
         self._weights = model.weights / model.scale
         self._offset = model.bias - self._weights @ model.mean
+        self._prior = model.prior
 
     @property
     def requires(self) -> tuple[frozenset[Sensor], ...]:
@@ -57,18 +58,23 @@ class Learned:
         return self._features.get_features(observation)
 
     def decide(self, stamp_ns: int, features: NDArray[np.float64] | None) -> SceneVote:
-        """Return the most probable scene for features (F,), with equal prior probabilities."""
+        """Return the most probable scene for features (F,), with the training's prior.
+
+        The likelihoods of the vote are without it: a policy has a prior of its own.
+        """
         if features is None or np.isnan(features).any():
             return SceneVote(stamp_ns=stamp_ns, scene=UNSURE)
         scores = self._weights @ features + self._offset
         shares = np.exp(scores - scores.max())
         shares /= shares.sum()
         best = int(np.argmax(shares))
+        likelihoods = shares / self._prior
+        likelihoods /= likelihoods.sum()
         return SceneVote(
             stamp_ns=stamp_ns,
             scene=self.scenes[best],
             value=float(shares[best]),
-            likelihoods=dict(zip(self.scenes, shares.tolist(), strict=True)),
+            likelihoods=dict(zip(self.scenes, likelihoods.tolist(), strict=True)),
         )
 
     def shutdown(self) -> None:

@@ -15,6 +15,7 @@ from sceneslam.types.errors import ConfigError
 from sceneslam.types.scene_model import SceneModel, read_scene_model
 
 _DIGITS = 5  # significant digits in the file
+_PRIOR_MIN = 1e-6  # of a scene whose labels gain nothing: it has no weight
 
 
 class Model(SceneModel):
@@ -28,6 +29,7 @@ class Model(SceneModel):
 
     def cooled(self, temperature: float) -> Model:
         """Return the model with its logits divided by a temperature (below 1: more certain)."""
+        prior = self.prior ** (1.0 / temperature)
         return Model(
             scenes=self.scenes,
             features=self.features,
@@ -35,6 +37,7 @@ class Model(SceneModel):
             scale=self.scale,
             weights=self.weights / temperature,
             bias=self.bias / temperature,
+            prior=prior / prior.sum(),
         )
 
     def write(self, path: Path, comment: Sequence[str]) -> None:
@@ -48,6 +51,7 @@ class Model(SceneModel):
                 scene: _rounded(row) for scene, row in zip(self.scenes, self.weights, strict=True)
             },
             "bias": dict(zip(self.scenes, _rounded(self.bias), strict=True)),
+            "prior": dict(zip(self.scenes, _rounded(self.prior), strict=True)),
         }
         text = "".join(f"# {line}\n" for line in comment)
         text += yaml.safe_dump(node, sort_keys=False, default_flow_style=None, width=100)
@@ -75,6 +79,8 @@ def fit(
 ) -> Model:
     """Return the model for features (N, F) with a scene and a weight each.
 
+    Its prior is each scene's share of the weight.
+
     Raises ConfigError if scikit-learn is not installed.
     """
     try:
@@ -91,6 +97,7 @@ def fit(
     rows, bias = np.asarray(regression.coef_), np.asarray(regression.intercept_)
     if len(rows) == 1:  # with two scenes it fits the logit of the second only
         rows, bias = np.concatenate([-rows, rows]) / 2, np.concatenate([-bias, bias]) / 2
+    totals = np.array([weights[np.array(labels) == scene].sum() for scene in regression.classes_])
     return Model(
         scenes=tuple(map(str, regression.classes_)),
         features=tuple(names),
@@ -98,6 +105,7 @@ def fit(
         scale=scale,
         weights=rows,
         bias=bias,
+        prior=np.maximum(totals / totals.sum(), _PRIOR_MIN),
     )
 
 

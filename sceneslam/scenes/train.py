@@ -98,7 +98,7 @@ def _weights(all_seen: Sequence[MeasuredExample]) -> NDArray[np.float64]:
     """Return the weights (N,) of all images.
 
     All scenes have the same weight, and so have all examples of a scene, unless they have weights
-    of their own.
+    of their own, by which a scene where more is gained is more probable.
     """
     total = _IMAGES_PER_SCENE * len(_scenes(all_seen))
     weights = np.concatenate([seen.weights for seen in all_seen])
@@ -115,15 +115,22 @@ def _weights(all_seen: Sequence[MeasuredExample]) -> NDArray[np.float64]:
 def _temperature(held_out: Sequence[Judged]) -> float:
     """Return the temperature for which the held-out scenes have the largest likelihood.
 
+    Images have the weights of the training.
     The logits are divided by it, which changes no vote (temperature scaling; Guo et al., ICML
     2017). It is at least 1: a few correct recordings are no reason for more certainty than the fit
     has.
     """
-    losses = [sum(_loss(one, temperature) for one in held_out) for temperature in _TEMPERATURES]
+    if not held_out:
+        return 1.0
+    weights = _weights([one.seen for one in held_out])
+    losses = [
+        weights @ np.concatenate([_losses(one, temperature) for one in held_out])
+        for temperature in _TEMPERATURES
+    ]
     return float(_TEMPERATURES[int(np.argmin(losses))])
 
 
-def _loss(one: Judged, temperature: float) -> float:
-    """Return the mean negative log-likelihood of the true scene."""
+def _losses(one: Judged, temperature: float) -> NDArray[np.float64]:
+    """Return (N,) the negative log-likelihood of the true scene."""
     true = shares(one.scores / temperature)[:, one.scenes.index(one.seen.example.scene)]
-    return float(-np.log(np.maximum(true, 1e-12)).mean())
+    return np.asarray(-np.log(np.maximum(true, 1e-12)))

@@ -26,10 +26,14 @@ class SceneModel:
     scale: NDArray[np.float64]  # (F,), above 0
     weights: NDArray[np.float64]  # (S, F)
     bias: NDArray[np.float64]  # (S,)
+    prior: NDArray[np.float64]  # (S,), above 0: the probabilities of the scenes without any feature
 
 
 def read_scene_model(path: Path) -> SceneModel:
-    """Return the model in a file; raises InputError if it is missing or invalid."""
+    """Return the model in a file; without `prior`, all scenes are equally probable.
+
+    Raises InputError if it is missing or invalid.
+    """
     if not path.is_file():
         raise InputError(f"model not found (python -m sceneslam.scenes train makes one): {path}")
     try:
@@ -41,6 +45,7 @@ def read_scene_model(path: Path) -> SceneModel:
         raise InputError(f"model: it has no {', '.join(missing)}: {path}")
     try:
         scenes = tuple(map(str, node["scenes"]))
+        prior = node.get("prior") or dict.fromkeys(scenes, 1.0 / len(scenes))
         model = SceneModel(
             scenes=scenes,
             features=tuple(map(str, node["features"])),
@@ -48,6 +53,7 @@ def read_scene_model(path: Path) -> SceneModel:
             scale=np.array(node["scale"], np.float64),
             weights=np.array([node["weights"][scene] for scene in scenes], np.float64),
             bias=np.array([node["bias"][scene] for scene in scenes], np.float64),
+            prior=np.array([prior[scene] for scene in scenes], np.float64),
         )
         _check(model)
     except (KeyError, TypeError, ValueError) as error:
@@ -61,9 +67,10 @@ def _check(model: SceneModel) -> None:
     is_shaped = (
         model.mean.shape == model.scale.shape == (features,)
         and model.weights.shape == (scenes, features)
-        and model.bias.shape == (scenes,)
+        and model.bias.shape == model.prior.shape == (scenes,)
     )
-    numbers = (model.mean, model.scale, model.weights, model.bias)
-    is_finite = all(np.isfinite(one).all() for one in numbers) and (model.scale > 0).all()
-    if not (is_shaped and is_finite and len(set(model.scenes)) == scenes):
+    numbers = (model.mean, model.scale, model.weights, model.bias, model.prior)
+    is_finite = all(np.isfinite(one).all() for one in numbers)
+    is_positive = (model.scale > 0).all() and (model.prior > 0).all()
+    if not (is_shaped and is_finite and is_positive and len(set(model.scenes)) == scenes):
         raise ValueError("shapes, or numbers that are not finite")
