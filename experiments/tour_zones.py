@@ -19,11 +19,12 @@ from typing import Any
 
 import numpy as np
 
-from sceneslam.evaluation.association import interpolated
+from sceneslam.evaluation.association import covered, interpolated
 from sceneslam.sources.simulator.places.floor import BuildingLayout
 from sceneslam.sources.simulator.shot import floor_plan
 from sceneslam.types import se3
 from sceneslam.types.trajectory import Trajectory
+from sceneslam.types.truth import TRUTH_GAP_S
 
 _SHORTEST_S = 2.0  # of a drive through a zone; shorter: a corner of the next one
 
@@ -52,7 +53,7 @@ def main() -> None:
 
 
 def drives(run: Path) -> Iterator[tuple[str, float]]:
-    """Yield zone and error [m] of every drive through a zone; NaN where the run has no pose."""
+    """Yield zone and error [m] of every drive through a zone; NaN without a pose at a door."""
     truth = Trajectory.read_tum(run / "groundtruth.tum")
     estimate = Trajectory.read_tum(run / "trajectory.tum")
     names = _zones(truth, floor_plan("building", _order(run)))
@@ -79,10 +80,9 @@ def _zones(truth: Trajectory, plan: BuildingLayout) -> Any:
 
 
 def _error_m(estimate: Trajectory, truth: Trajectory, span_ns: Any) -> float:
-    if len(estimate) < 2 or not estimate.stamps_ns[0] <= span_ns[0] < estimate.stamps_ns[-1]:
+    if len(covered(estimate, span_ns, TRUTH_GAP_S)) < 2:
         return float("nan")
-    ends_ns = np.minimum(span_ns, estimate.stamps_ns[-1])
-    told, true = (interpolated(one, ends_ns).T_world_base for one in (estimate, truth))
+    told, true = (interpolated(one, span_ns).T_world_base for one in (estimate, truth))
     T_told, T_true = (se3.inverse(poses[0]) @ poses[1] for poses in (told, true))
     return float(np.linalg.norm(T_told[:3, 3] - T_true[:3, 3]))
 

@@ -14,6 +14,7 @@ from sceneslam.experiments.matrix.experiment import MatrixExperiment
 from sceneslam.experiments.matrix.oracle import best_of
 from sceneslam.experiments.matrix.promises import Promises
 from sceneslam.experiments.matrix.sweep import Grid, sweep
+from sceneslam.experiments.tour_zones import _error_m
 from sceneslam.types import se3
 from sceneslam.types.experiment import Trial, TrialResult
 from sceneslam.types.trajectory import Trajectory
@@ -63,6 +64,13 @@ def test_oracle_is_no_worse_than_any_module_alone_however_long_the_pieces():
     for piece_s in (0.6, 3.0, 100.0):
         error_m = segment_m(best_of(modules, truth, piece_s, 2.0), truth, 2.0)
         assert all(error_m <= segment_m(one, truth, 2.0) + 1e-3 for one in modules), piece_s
+
+
+def test_a_drive_through_a_zone_has_no_error_without_a_pose_at_its_doors():
+    truth, estimate = driven(np.ones(6)), driven([1.1, 1.1, NAN, NAN, 1.1, 1.1])
+    ends_ns = 10**9 * np.array([[0, 1], [1, 3], [3, 5], [1, 5]])
+    errors_m = [_error_m(estimate, truth, ends) for ends in ends_ns]
+    np.testing.assert_allclose(errors_m, [0.1, NAN, NAN, 1.8], atol=1e-9)
 
 
 def segment_m(estimate, truth, length_m):
