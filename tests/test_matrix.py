@@ -114,6 +114,14 @@ def test_a_promise_fails_when_it_is_broken(ours, alone, failed):
     assert [figure.name for figure in figures if not figure.holds] == failed
 
 
+def test_false_switches_that_are_unknown_at_one_seed_break_their_promise():
+    promises = Promises(judged="rewind", regret_max=0.25, false_max=0.0)
+    known = cell("rewind")
+    cells = [cell("alone"), known, replace(known, seed=1, false_switches=NAN)]
+    figures = list(promises.figures(cells, ["alone"]))
+    assert not figures[-1].holds and figures[-1].name == "rewind: false switches, any seed"
+
+
 def test_regret_is_of_the_errors_of_all_stories_together():
     small, large = (
         replace(cell("rewind", segment_m=error_m, regret=regret), story=story)

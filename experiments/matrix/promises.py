@@ -36,7 +36,7 @@ class Promises:
         least = float(np.nanmin([regret_of(drives) for drives in _whole(cells)]))
         yield Figure.at_least("least regret of any strategy, any seed", least, 0.0)
         if self.false_max is not None:
-            most = max(c.false_switches for c in cells if c.strategy == self.judged)
+            most = float(np.max([cell.false_switches for cell in ours]))
             yield Figure.at_most(f"{self.judged}: false switches, any seed", most, self.false_max)
 
     def _of_story(self, story: str, ours: Cell, alone: Sequence[Cell]) -> Iterator[Figure]:
