@@ -32,6 +32,12 @@ def test_exposure_scales_light_and_not_grey_values(exposure_ratio):
     assert light_mean(image, exposure_ratio) == pytest.approx(min(expected, 255.0), abs=0.5)
 
 
+def test_a_saturated_pixel_is_as_bright_as_it_has_to_be_at_least():
+    white = np.full((120, 160, 3), 255, np.uint8)
+    assert light_mean(white, 0.25) == 255.0
+    assert light_mean(white, 4.0) == pytest.approx(137.0, abs=0.5)
+
+
 def test_automatic_exposure_hides_darkness_from_the_image_alone():
     """Three quarters of the light are gone; the exposure makes up for all of it."""
     source = lights_out(film(GREY), lights="off", ambient_ratio=0.25, exposure_gain_max=4.0)

@@ -33,7 +33,8 @@ def light_mean(image_bgr: NDArray[np.uint8], exposure_ratio: float) -> float:
     """Return the mean grey value, in [0, 255], that a BGR image (H, W, 3) has at exposure 1.
 
     Grey values are converted to light by the sRGB curve (IEC 61966-2-1), and light is proportional
-    to the exposure. Saturated pixels keep their value.
+    to the exposure. A saturated pixel counts as the least light that saturates it, and light beyond
+    white at exposure 1 as white.
     """
     step = max(1, min(image_bgr.shape[:2]) // _ROWS)
     grey = cv2.cvtColor(np.ascontiguousarray(image_bgr[::step, ::step]), cv2.COLOR_BGR2GRAY)
