@@ -21,7 +21,7 @@ from sceneslam.types.se3 import Transform
 LASTING = ("reversed", "frozen", "slipping")  # for some seconds, repeatedly
 ALWAYS = ("scaled", "turning", "late", "absent")
 LIES = ("none", *LASTING, *ALWAYS, "spikes")
-_DRIVING_M_S = 0.05  # below this speed, no error is added
+_DRIVING_M_S = 0.05  # below this speed, no temporary error begins
 
 
 class SpoiltOdometry(Wrapped):
