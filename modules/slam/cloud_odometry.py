@@ -6,7 +6,7 @@ Such libraries return a pose for any input, also for empty clouds, NaN or a bare
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from importlib.util import find_spec
 from typing import ClassVar
 
@@ -17,6 +17,7 @@ from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.maps import MapLayers, PointLayer
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
+from sceneslam.types.ranges import Checked, check_above, check_between, ranged
 from sceneslam.types.rig import Rig, Sensor
 
 from .cloud_map import CloudMap
@@ -37,19 +38,19 @@ _DIFFUSE = 1e6  # prediction's variances in units of a cloud's, if ICP decides a
 
 
 @dataclass(kw_only=True, eq=False)
-class CloudOdometry(LocalModule, ABC):
+class CloudOdometry(LocalModule, Checked, ABC):
     """Implements `SlamModule` by a `CloudMap`; the settings are described in each YAML file."""
 
     library: ClassVar[str | None] = None  # an extra that has to be installed, named as its package
-    voxel_m: float | None
-    depth_range_max_m: float
-    depth_stride_px: int
+    voxel_m: float | None = ranged(check_above, 0)
+    depth_range_max_m: float = ranged(check_above, 0)
+    depth_stride_px: int = ranged(check_above, 0)
     deskew: bool
-    noise_m: float | None
-    overlap_min_ratio: float
+    noise_m: float | None = ranged(check_above, 0)
+    overlap_min_ratio: float = ranged(check_between, 0, 1)
     weak_ratio: float
-    speed_max_m_s: float | None
-    turn_max_rad_s: float
+    speed_max_m_s: float | None = ranged(check_above, 0)
+    turn_max_rad_s: float = ranged(check_above, 0)
     _reader: CloudReader | None = field(default=None, init=False)
     _icp: CloudMap | None = field(default=None, init=False)
     _predictor: Predictor = field(init=False)
@@ -59,15 +60,9 @@ class CloudOdometry(LocalModule, ABC):
         if self.library is not None and find_spec(self.library) is None:
             name = type(self).__name__
             raise ConfigError("_target_", name, f"pip install 'sceneslam[{self.library}]'")
-        if not 0 <= self.overlap_min_ratio <= 1:
-            raise ConfigError("overlap_min_ratio", self.overlap_min_ratio, "0 to 1")
+        super().__post_init__()
         if not 0 <= self.weak_ratio < 1:
             raise ConfigError("weak_ratio", self.weak_ratio, "0 (never weak) to below 1")
-        for name in (one.name for one in fields(self) if one.init):
-            value = getattr(self, name)
-            is_number = isinstance(value, float | int) and not isinstance(value, bool)
-            if is_number and not name.endswith("_ratio") and not 0 < value < np.inf:
-                raise ConfigError(name, value, "above 0")
 
     @property
     def requires(self) -> tuple[frozenset[Sensor], ...]:

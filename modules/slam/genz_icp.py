@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation
+from sceneslam.types.ranges import check_above, ranged
 
 from .cloud_map import CloudMap
 from .cloud_odometry import CloudOdometry
@@ -30,11 +31,11 @@ class GenzIcp(CloudOdometry):
     """Registers 3D clouds; the settings are described in `conf/slam/genz_icp.yaml`."""
 
     library: ClassVar[str | None] = "genz_icp"
-    points_desired: int
-    planarity_max: float
-    initial_threshold_m: float | None
-    motion_min_m: float | None
-    iterations_max: int
+    points_desired: int = ranged(check_above, 0)
+    planarity_max: float = ranged(check_above, 0)
+    initial_threshold_m: float | None = ranged(check_above, 0)
+    motion_min_m: float | None = ranged(check_above, 0)
+    iterations_max: int = ranged(check_above, 0)
 
     def make_map(self, voxel_m: float, reader: CloudReader) -> CloudMap:
         """Return the library's map."""

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation
+from sceneslam.types.ranges import check_above, ranged
 
 from .cloud_map import CloudMap
 from .cloud_odometry import CloudOdometry
@@ -24,10 +25,10 @@ from .clouds import Cloud, CloudReader
 class KissIcp(CloudOdometry):
     """Registers 3D clouds; the settings are described in `conf/slam/kiss_icp.yaml`."""
 
-    initial_threshold_m: float | None
-    motion_min_m: float | None
-    points_per_voxel: int
-    iterations_max: int
+    initial_threshold_m: float | None = ranged(check_above, 0)
+    motion_min_m: float | None = ranged(check_above, 0)
+    points_per_voxel: int = ranged(check_above, 0)
+    iterations_max: int = ranged(check_above, 0)
 
     def make_map(self, voxel_m: float, reader: CloudReader) -> CloudMap:
         """Return the library's map."""

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from sceneslam.scans.deskew import valid_times_s
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation
+from sceneslam.types.ranges import check_above, ranged
 from sceneslam.types.rig import Sensor
 
 from .cloud_map import CloudMap
@@ -29,7 +30,7 @@ class RkoLio(CloudOdometry):
     """Registers a lidar's clouds; the settings are described in `conf/slam/rko_lio.yaml`."""
 
     library: ClassVar[str | None] = "rko_lio"
-    correspondence_max_m: float | None
+    correspondence_max_m: float | None = ranged(check_above, 0)
     is_at_rest_first: bool
     depth_range_max_m: float = field(default=1.0, init=False)  # depth is not used
     depth_stride_px: int = field(default=1, init=False)

@@ -8,9 +8,10 @@ import numpy as np
 
 from sceneslam.motion.predictor import Prediction, Predictor
 from sceneslam.types import se3
-from sceneslam.types.errors import ConfigError, InputError
+from sceneslam.types.errors import InputError
 from sceneslam.types.maps import MapLayers, PointLayer
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
+from sceneslam.types.ranges import Checked, check_above, check_inside, ranged
 from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.trajectory import Trajectory
 
@@ -27,23 +28,15 @@ _SAMPLES_MIN = 100
 
 
 @dataclass(kw_only=True, eq=False)
-class DepthSlam(LocalModule):
+class DepthSlam(LocalModule, Checked):
     """Registers depth images with keyframes; settings as in `conf/slam/depth.yaml`."""
 
-    keyframe_overlap_ratio: float
-    matched_min_ratio: float
-    weak_ratio: float
-    cloud_voxel_m: float
+    keyframe_overlap_ratio: float = ranged(check_inside, 0, 1)
+    matched_min_ratio: float = ranged(check_inside, 0, 1)
+    weak_ratio: float = ranged(check_inside, 0, 1)
+    cloud_voxel_m: float = ranged(check_above, 0)
     _predictor: Predictor = field(init=False)
     _map: KeyframeMap = field(init=False)
-
-    def __post_init__(self) -> None:
-        """Check the settings."""
-        for name in ("keyframe_overlap_ratio", "matched_min_ratio", "weak_ratio"):
-            if not 0 < getattr(self, name) < 1:
-                raise ConfigError(name, getattr(self, name), "between 0 and 1")
-        if not 0 < self.cloud_voxel_m < np.inf:
-            raise ConfigError("cloud_voxel_m", self.cloud_voxel_m, "above 0 [m]")
 
     @property
     def requires(self) -> tuple[frozenset[Sensor], ...]:

@@ -14,9 +14,10 @@ import numpy as np
 
 from sceneslam.motion.predictor import Prediction, Predictor
 from sceneslam.types import se3
-from sceneslam.types.errors import ConfigError, InputError
+from sceneslam.types.errors import InputError
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import Observation, Tracking, TrackingStatus
+from sceneslam.types.ranges import Checked, check_above, check_inside, ranged
 from sceneslam.types.rig import Rig, Sensor
 
 from ..camera_certainty import CameraCertainty
@@ -25,10 +26,6 @@ from .comparison import Comparison, compare
 from .keyframes import DirectKeyframes
 from .view import DirectView, Tracker
 
-_POSITIVE = (
-    "width_px keyframe_step_m keyframe_turn_rad step_max_m turn_max_rad weak_m weak_rad "
-    "cloud_voxel_m"
-)
 _PIXELS_MIN = 300  # smallest number of pixels that both views show
 _FROZEN_NS = 100_000_000  # an image is repeated where one was lost, but not for longer
 
@@ -42,26 +39,18 @@ class _Located:
 
 
 @dataclass(kw_only=True, eq=False)
-class DirectSlam(LocalModule):
+class DirectSlam(LocalModule, Checked):
     """Registers images with depth; the settings are described in `conf/slam/direct.yaml`."""
 
-    width_px: int
-    keyframe_step_m: float
-    keyframe_turn_rad: float
-    step_max_m: float
-    turn_max_rad: float
-    matched_min_ratio: float
-    weak_m: float
-    weak_rad: float
-    cloud_voxel_m: float
-
-    def __post_init__(self) -> None:
-        """Check the settings."""
-        for name in _POSITIVE.split():
-            if not 0 < getattr(self, name) < np.inf:
-                raise ConfigError(name, getattr(self, name), "above 0")
-        if not 0 < self.matched_min_ratio < 1:
-            raise ConfigError("matched_min_ratio", self.matched_min_ratio, "between 0 and 1")
+    width_px: int = ranged(check_above, 0)
+    keyframe_step_m: float = ranged(check_above, 0)
+    keyframe_turn_rad: float = ranged(check_above, 0)
+    step_max_m: float = ranged(check_above, 0)
+    turn_max_rad: float = ranged(check_above, 0)
+    matched_min_ratio: float = ranged(check_inside, 0, 1)
+    weak_m: float = ranged(check_above, 0)
+    weak_rad: float = ranged(check_above, 0)
+    cloud_voxel_m: float = ranged(check_above, 0)
 
     @property
     def requires(self) -> tuple[frozenset[Sensor], ...]:

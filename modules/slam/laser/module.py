@@ -17,6 +17,7 @@ from sceneslam.types.errors import ConfigError
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import LaserScan, Observation, Tracking
 from sceneslam.types.planar import to_transform
+from sceneslam.types.ranges import Checked, check_above, check_between, check_least, ranged
 from sceneslam.types.rig import Rig, Sensor
 
 from ..local import LocalModule
@@ -26,42 +27,34 @@ from .matcher import Matcher
 from .relocalizer import ScanRelocalizer
 from .surface import ScanSurfaceReader
 
-_ABOVE_0 = (
-    "resolution_m range_max_m laser_noise_m depth_noise_m window_m window_rad "
-    "keyframe_distance_m keyframe_angle_rad"
-)
-_NOT_BELOW_0 = "depth_noise_per_m depth_shift_m predict_max_s"
-_AT_LEAST_1 = "beams_min submap_keyframes depth_beams depth_stride_px lidar_beams"
-_RATIO = "inlier_min_ratio degeneracy_ratio"
-
 
 @dataclass(kw_only=True, eq=False)
-class LaserSlam(LocalModule):
+class LaserSlam(LocalModule, Checked):
     """2D SLAM from a laser, or from a lidar or depth image converted to a scan: x, y, yaw.
 
     The fields are the settings; `conf/slam/laser.yaml` describes each one.
     """
 
-    resolution_m: float
-    range_max_m: float
-    laser_noise_m: float
-    depth_noise_m: float
-    depth_noise_per_m: float
-    depth_shift_m: float
-    beams_min: int
-    inlier_min_ratio: float
-    window_m: float
-    window_rad: float
-    degeneracy_ratio: float
-    keyframe_distance_m: float
-    keyframe_angle_rad: float
-    submap_keyframes: int
-    predict_max_s: float
+    resolution_m: float = ranged(check_above, 0)
+    range_max_m: float = ranged(check_above, 0)
+    laser_noise_m: float = ranged(check_above, 0)
+    depth_noise_m: float = ranged(check_above, 0)
+    depth_noise_per_m: float = ranged(check_least, 0)
+    depth_shift_m: float = ranged(check_least, 0)
+    beams_min: int = ranged(check_least, 1)
+    inlier_min_ratio: float = ranged(check_between, 0, 1)
+    window_m: float = ranged(check_above, 0)
+    window_rad: float = ranged(check_above, 0)
+    degeneracy_ratio: float = ranged(check_between, 0, 1)
+    keyframe_distance_m: float = ranged(check_above, 0)
+    keyframe_angle_rad: float = ranged(check_above, 0)
+    submap_keyframes: int = ranged(check_least, 1)
+    predict_max_s: float = ranged(check_least, 0)
     height_min_m: float | None
     height_max_m: float | None
-    depth_beams: int
-    depth_stride_px: int
-    lidar_beams: int
+    depth_beams: int = ranged(check_least, 1)
+    depth_stride_px: int = ranged(check_least, 1)
+    lidar_beams: int = ranged(check_least, 1)
     deskew: bool
     _scanner: DepthScanner | LidarScanner | None = field(default=None, init=False)
     _front_end: FrontEnd | None = field(default=None, init=False)
@@ -71,15 +64,7 @@ class LaserSlam(LocalModule):
 
     def __post_init__(self) -> None:
         """Check the settings."""
-        for names, least, most, allowed in (
-            (_ABOVE_0, 1e-9, np.inf, "above 0"),
-            (_NOT_BELOW_0, 0.0, np.inf, "0 or more"),
-            (_AT_LEAST_1, 1, np.inf, "1 or more"),
-            (_RATIO, 0.0, 1.0, "0 to 1"),
-        ):
-            for name in names.split():
-                if not least <= getattr(self, name) <= most:
-                    raise ConfigError(name, getattr(self, name), allowed)
+        super().__post_init__()
         low_m, high_m = self.height_min_m, self.height_max_m
         if low_m is not None and high_m is not None and not low_m < high_m:
             raise ConfigError("height_max_m", high_m, f"above height_min_m ({low_m:g} m)")
