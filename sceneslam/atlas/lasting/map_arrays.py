@@ -100,7 +100,7 @@ def arrays_of(saved: SavedMap, modules: list[str]) -> dict[str, NDArray[Any]]:
 def packed(arrays: Mapping[str, NDArray[Any]]) -> bytes:
     """Return an npz whose bytes depend on the arrays alone, not on the time."""
     buffer = io.BytesIO()
-    rows = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+    rows: dict[str, Any] = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
     np.savez_compressed(buffer, **rows)
     return buffer.getvalue()
 
