@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.types.rig import Sensor
-from sceneslam.types.se3 import Transform
+from sceneslam.types.se3 import Transform, hat
 
 _GYRO_GAP_S = 0.1  # a turn rate is not extrapolated over a longer gap
 UNSURE = "Unsure"  # the scene of a vote that could not be cast
@@ -92,7 +92,10 @@ class Observation:
         if np.diff(times).max() > _GYRO_GAP_S:
             return None
         rates = np.concatenate([gyro[:1, 1:], gyro[:, 1:], gyro[-1:, 1:]])
-        return np.asarray(np.trapezoid(rates, times, axis=0))
+        turns_rad = 0.5 * (rates[:-1] + rates[1:]) * np.diff(times)[:, None]
+        # Rotations about changing axes do not commute: the second term of Magnus' expansion (1954).
+        swept = hat(np.cumsum(turns_rad, axis=0)[:-1]) @ turns_rad[1:, :, None]
+        return np.asarray(turns_rad.sum(axis=0) + 0.5 * swept.sum(axis=0)[:, 0])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
