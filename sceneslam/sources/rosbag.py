@@ -98,8 +98,8 @@ class RosBag:
     def length(self) -> int | None:
         """Return the number of messages of the primary topic.
 
-        None if another topic sets the pace at the beginning or the end. In a gap of this one, others
-        give observations that are not counted.
+        None if another topic sets the pace at the beginning or the end. In a gap of this one,
+        others give observations that are not counted.
         """
         if any(sensor is not self._primary for sensor in self._paces()):
             return None
