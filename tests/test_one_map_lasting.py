@@ -66,7 +66,8 @@ def test_a_run_whose_poses_were_replaced_is_where_the_new_ones_lead(saved):
         for given in range(since, row + 1):
             T = T_run_base if row < 75 else right[given]
             own.add(given * step_ns, planar.to_transform(T), "a", np.eye(6) * 1e-4)
-        own.observe(Observation(stamp_ns=row * step_ns, scan=room.scan(pose, 0)), None)
+        seen = Observation(stamp_ns=row * step_ns, scan=room.scan(pose, row * step_ns))
+        own.observe(seen, None)
         at = planar.compose(map_of(first), pose)
         off_m.append(np.linalg.norm(own.pose_at(row * step_ns)[:2, 3] - at[:2]))
     assert own.finish() == [] and "relocalization_withdrawn" not in events
