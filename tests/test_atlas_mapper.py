@@ -39,7 +39,7 @@ class Searched:
         self.piece_ns, self.pieces_ns = 0, [0]
         self.is_located = False
 
-    def _made(self, plan, views, *, standing):
+    def _made(self, plan, views, *, standing, wheels):
         self.standing = standing
         return self
 

@@ -102,17 +102,18 @@ def test_ctrl_c_that_ends_what_hangs_at_the_end_of_a_run_costs_no_result(tmp_pat
     assert len(Trajectory.read_tum(tmp_path / "trajectory.tum")) == 1
 
 
+@pytest.mark.usefixtures("heeds_ctrl_c")
 @pytest.mark.parametrize("times", [1, 2, 3])
 def test_live_run_saves_nothing_beside_the_step_that_ctrl_c_interrupted(
     tmp_path, monkeypatch, times
 ):
     keep, finish, is_left, order = Keeping.keep, Atlas.finish, threading.Event(), []
 
-    def slow(self, stamp_ns):
+    def slow(self):
         for _ in range(times):
             signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
             is_left.wait(0.3)
-        keep(self, stamp_ns)
+        keep(self)
         order.append("stepped")
 
     def finished(self):
