@@ -218,10 +218,13 @@ def test_a_warning_without_a_stamp_does_not_begin_the_recording(tmp_path: Path) 
     recording = open_recording(tmp_path / "run.mcap")
     times_ns = [one.log_ns for one in recording.messages({names.RESULT_EVENTS})]
     assert times_ns == [made[0].stamp_ns] * 2
-    sink.open(RIG, tmp_path)  # a run without an observation
+    sink.open(RIG, tmp_path / "next")  # a run without an observation
     sink.write_event(warning)
     sink.close()
-    assert len(list(open_recording(tmp_path / "run.mcap").messages({names.RESULT_EVENTS}))) == 1
+    assert (
+        len(list(open_recording(tmp_path / "next" / "run.mcap").messages({names.RESULT_EVENTS})))
+        == 1
+    )
 
 
 def test_truth_that_is_longer_than_the_run_moves_neither_map_nor_path(tmp_path: Path) -> None:

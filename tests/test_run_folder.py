@@ -16,7 +16,7 @@ from sceneslam.sinks.ros2.sink import Ros2Sink
 from sceneslam.storage.folder import RunFolder, give_back
 from sceneslam.storage.reserve import Reserve
 from sceneslam.types.errors import ConfigError, InputError
-from sceneslam.types.files import MARK, finish, own, part_of, replacing
+from sceneslam.types.files import MARK, finish, new_file, own, part_of, replacing
 
 CLAIM = """
 import sys
@@ -165,6 +165,18 @@ def test_a_file_of_a_sink_has_its_name_once_it_is_finished(tmp_path):
     (tmp_path / "other.mcap").touch()
     with pytest.raises(FileExistsError):
         own(tmp_path / "other.mcap")
+
+
+@pytest.mark.parametrize("name", ["in.mcap", "run/journal.bin", "run/half.mcap"])
+def test_a_sink_replaces_no_file_that_is_there(tmp_path, name):
+    (tmp_path / "run").mkdir()
+    there = tmp_path / (f"{name}.part" if "half" in name else name)
+    there.write_text("mine")
+    with pytest.raises(FileExistsError):
+        new_file(tmp_path / "run", str(tmp_path / name))
+    assert there.read_text() == "mine"
+    assert new_file(tmp_path / "run", "../out/a.mcap") == tmp_path / "out" / "a.mcap"
+    assert (tmp_path / "out").is_dir()
 
 
 def test_a_full_disk_closes_the_sinks_that_write_files_alone(tmp_path, monkeypatch):

@@ -10,7 +10,7 @@ from pathlib import Path
 from sceneslam.ros.pixels import image_options
 from sceneslam.ros.writer import ObservationWriter
 from sceneslam.types.errors import ConfigError
-from sceneslam.types.files import finish, part_of
+from sceneslam.types.files import finish, new_file, part_of
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig
 from sceneslam.types.run import Event, RunResult
@@ -36,7 +36,7 @@ class McapSink:
         for key, every in (("image_every", image_every), ("depth_every", depth_every)):
             if every < 1:
                 raise ConfigError(key, every, "a whole number of observations from 1")
-        self._path = self._file = Path(path)
+        self._path, self._file = path, Path()
         self._image_format, self._jpeg_quality = image_format, jpeg_quality
         self._image_every, self._depth_every = image_every, depth_every
         self._images = self._depths = 0
@@ -47,8 +47,7 @@ class McapSink:
 
     def open(self, rig: Rig, folder: Path) -> None:
         """Open the file, which gets its final name in `close`; a relative path is in `folder`."""
-        self._file = folder / self._path
-        self._file.parent.mkdir(parents=True, exist_ok=True)
+        self._file = new_file(folder, self._path)
         part = part_of(self._file)
         self._writer = ObservationWriter(
             part, rig=rig, image_format=self._image_format, jpeg_quality=self._jpeg_quality

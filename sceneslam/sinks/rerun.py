@@ -15,7 +15,7 @@ from sceneslam.sinks.rerun_sensors import SensorLog
 from sceneslam.sinks.rerun_viewer import Viewer
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
-from sceneslam.types.files import finish, part_of
+from sceneslam.types.files import finish, new_file, part_of
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig
 from sceneslam.types.run import Event, RunResult
@@ -92,8 +92,7 @@ class RerunSink:
             sys.stderr.write(f"{self._viewer.open()}\n")
             self._recording.connect_grpc(self._viewer.url, default_blueprint=layout)
         else:
-            self._file = folder / str(self._path)
-            self._file.parent.mkdir(parents=True, exist_ok=True)
+            self._file = new_file(folder, str(self._path))
             self._recording.save(part_of(self._file), default_blueprint=layout)
         self._recording.log("world", self._rr.ViewCoordinates.FLU, static=True)
         self._sensors.place(self._recording, rig)

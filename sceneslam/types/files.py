@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from sceneslam.types.errors import text_of
+from sceneslam.types.input_files import given_path
 
 MARK = ".sceneslam"  # in a folder that runs write into: one line about the run, then their files
 PART = ".part"  # at the end of a file's name until it is whole
@@ -41,6 +42,20 @@ def whole(path: Path, mode: str = "w", **options: Any) -> Iterator[IO[Any]]:
     except BaseException:
         part.unlink(missing_ok=True)
         raise
+
+
+def new_file(folder: Path, path: str) -> Path:
+    """Return the path of a file that a run will write, in its folder unless absolute; make that.
+
+    Raises FileExistsError where there is such a file, as the recording that is read, or its part,
+    and InputError for an empty path.
+    """
+    file = (folder / given_path(path)).resolve()
+    for known in (file, file.with_name(file.name + PART)):
+        if os.path.lexists(known):
+            raise FileExistsError(errno.EEXIST, "this file is not replaced", str(known))
+    file.parent.mkdir(parents=True, exist_ok=True)
+    return file
 
 
 def part_of(path: Path) -> Path:
