@@ -25,6 +25,7 @@ import sceneslam
 from sceneslam.app import Finished, run
 from sceneslam.catalogue import listing
 from sceneslam.config import files
+from sceneslam.config.overlay import typed_words
 from sceneslam.config.resolve import resolved
 from sceneslam.config.settings import DETECT_ONLY
 from sceneslam.config.words import (
@@ -170,8 +171,10 @@ def carry_out(config: DictConfig) -> Ended:
     """Run one job, print its summary and return its result; raises KeyboardInterrupt if stopped."""
     folder = Path(HydraConfig.get().runtime.output_dir)
     try:
-        check_trust(config, HydraConfig.get().overrides.task)
-        check_choices(HydraConfig.get().overrides.task)
+        resolved(config)  # names a broken `${...}` before any key is read
+        words = typed_words(HydraConfig.get().overrides.task)
+        check_trust(config, words)
+        check_choices(words)
         if config.get("experiment"):
             verdict = run_experiment(config, folder)
             print("\n".join([*verdict_lines(verdict), f"report  {_short(folder)}/report.html"]))
@@ -261,7 +264,7 @@ def _reference(config: DictConfig) -> dict[str, Any]:
     except OmegaConfBaseException as error:
         key = f"reference.{getattr(error, 'full_key', '') or ''}".rstrip(".")
         raise ConfigError(key, OmegaConf.to_container(config.reference), allowed) from error
-    check_trust(cast(DictConfig, other), HydraConfig.get().overrides.task)
+    check_trust(cast(DictConfig, other), typed_words(HydraConfig.get().overrides.task))
     return resolved(cast(DictConfig, other))
 
 

@@ -23,7 +23,7 @@ from sceneslam.app import run
 from sceneslam.config.build import opened_source
 from sceneslam.config.check import check_given, check_maps_apart, check_no_reference, first_line
 from sceneslam.config.component import ComponentBuilder
-from sceneslam.config.overlay import command_of, comment_of
+from sceneslam.config.overlay import command_of, comment_of, typed_words
 from sceneslam.config.provenance import files_written, provenance, save_config
 from sceneslam.config.resolve import resolved
 from sceneslam.config.settings import DETECT_ONLY
@@ -63,7 +63,7 @@ def run_experiment(config: DictConfig, folder: Path) -> Verdict:
     folder.mkdir(parents=True, exist_ok=True)
     hydra = HydraConfig.get()
     with tqdm(desc=key, unit="run", leave=False) as bar:
-        trials = _Trials(key, folder / "runs", hydra.overrides.task, jobs, bar)
+        trials = _Trials(key, folder / "runs", typed_words(hydra.overrides.task), jobs, bar)
         verdict = experiment.run(trials.run, folder)
     write_verdict(folder, key, verdict)
     save_config(plain, folder / "config.yaml")

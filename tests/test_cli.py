@@ -68,6 +68,8 @@ def test_run_says_what_happened_in_ten_lines_at_most(folder):
             "effects: got ['lights_out', 'depth_gap'], allowed: one of them at a time",
         ),
         ((*SINGLE, "--config-dir", "nowhere", "seed=1"), "nowhere' not found"),
+        ((*SINGLE, "seed=${nope}"), "seed: got 'an interpolation'"),
+        ((*SINGLE, "allow_targets=${foo:1}"), "allow_targets: got 'an interpolation'"),
         ((*SINGLE, "scenes.Any=[only"), "scenes.Any=[only: no viable"),
     ],
 )
@@ -76,6 +78,7 @@ def test_mistake_is_one_sentence_without_a_traceback(folder, overrides, sentence
     assert done.returncode in (1, 2)
     assert sentence in done.stderr + done.stdout
     assert "Traceback" not in done.stderr + done.stdout
+    assert not (folder / "out").exists()
 
 
 def test_a_mistake_is_one_sentence_whatever_is_set_for_hydra(folder, monkeypatch):

@@ -15,7 +15,7 @@ from types import SimpleNamespace
 import pytest
 from configured import config
 from fakes import LiveFeedSource
-from omegaconf import OmegaConf
+from omegaconf import ListConfig, OmegaConf
 
 from sceneslam import cli
 from sceneslam.config.provenance import provenance
@@ -195,7 +195,7 @@ def test_runs_beside_each_other_give_what_runs_in_turn_give_and_go_on_where_they
 def test_an_experiment_whose_bound_does_not_hold_ends_with_code_one(
     tmp_path, monkeypatch, capsys, bound_m, code
 ):
-    runtime, task = SimpleNamespace(output_dir=str(tmp_path)), SimpleNamespace(task=[])
+    runtime, task = SimpleNamespace(output_dir=str(tmp_path)), SimpleNamespace(task=ListConfig([]))
     given = SimpleNamespace(runtime=runtime, overrides=task)
     figures = [Figure.at_most("far", 0.05, bound_m, "m"), Figure.at_most("near", 0.0, 1.0, "m")]
     verdict = Verdict(figures=figures, table=Table(columns=(), rows=[]))
@@ -211,7 +211,7 @@ def test_a_disk_that_fails_in_an_experiment_is_one_sentence(tmp_path, monkeypatc
     def fail(*_):
         raise OSError(5, "input/output error", "verdict.json")
 
-    runtime, task = SimpleNamespace(output_dir=str(tmp_path)), SimpleNamespace(task=[])
+    runtime, task = SimpleNamespace(output_dir=str(tmp_path)), SimpleNamespace(task=ListConfig([]))
     given = SimpleNamespace(runtime=runtime, overrides=task)
     monkeypatch.setattr(cli.HydraConfig, "get", lambda: given)
     monkeypatch.setattr(cli, "run_experiment", fail)

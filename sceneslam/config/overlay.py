@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Sequence
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
+from typing import cast
 
 from hydra.conf import HydraConf
-from omegaconf import DictConfig
+from omegaconf import DictConfig, ListConfig, OmegaConf
 
 _COMMAND_LINE = "command-line"  # Hydra's name for the provider of --config-dir
 
@@ -28,10 +30,16 @@ def comment_of(hydra: HydraConf | DictConfig, group: str) -> list[str]:
 
 def command_of(hydra: HydraConf | DictConfig) -> str:
     """Return the command line that repeats the run."""
+    own, given = typed_words(hydra.overrides.task), typed_words(hydra.overrides.hydra)
     folders = [s.path for s in hydra.runtime.config_sources if s.provider == _COMMAND_LINE]
-    words = [word for word in hydra.overrides.hydra if not word.startswith("hydra.mode=")]
-    given = [word for folder in folders for word in ("--config-dir", folder)]
-    return shlex.join(["python", "-m", "sceneslam", *given, *hydra.overrides.task, *words])
+    words = [word for word in given if not word.startswith("hydra.mode=")]
+    beside = [word for folder in folders for word in ("--config-dir", folder)]
+    return shlex.join(["python", "-m", "sceneslam", *beside, *own, *words])
+
+
+def typed_words(overrides: Sequence[str]) -> list[str]:
+    """Return Hydra's record of overrides as they were typed, with unresolved `${...}`."""
+    return cast("list[str]", OmegaConf.to_container(cast(ListConfig, overrides), resolve=False))
 
 
 def _folder(schema: str, path: str) -> Traversable | None:

@@ -26,6 +26,7 @@ from omegaconf.errors import OmegaConfBaseException
 from sceneslam.collect.rows import ROWS
 from sceneslam.collect.status import State, Status
 from sceneslam.config.check import check_maps_apart
+from sceneslam.config.overlay import typed_words
 from sceneslam.config.resolve import without_hydra
 from sceneslam.config.settings import DETECT_ONLY
 from sceneslam.storage.folder import RunFolder, give_back
@@ -166,7 +167,7 @@ def _prepare(folder: Path, config: DictConfig) -> None:
         with (folder / COMPOSED).open("wb") as file:
             pickle.dump(config, file)
         if before is None:
-            overrides = [str(word) for word in config.hydra.overrides.task]
+            overrides = typed_words(config.hydra.overrides.task)
             Status(state=State.WAITING, config_sha256=digest, overrides=overrides).write(folder)
 
 
