@@ -4,10 +4,13 @@ import pytest
 from configured import config
 
 from sceneslam.app import run
+from sceneslam.config.check import check_keys
 from sceneslam.types.errors import ConfigError, InputError
 
 BAD = {
     "an unknown key": ({"scenaro": "x"}, "scenaro: got 'x'"),
+    "a decimal comma": ({"policy__gate": {"a_s": 1, 5: None}}, "policy.gate: got 5, allowed: keys"),
+    "a number as a key within a list": ({"sinks": [{5: None}]}, "sinks[0]: got 5, allowed: keys"),
     "an unknown argument": ({"policy__confirm_windw_s": 1.0}, "policy.confirm_windw_s"),
     "a missing argument": ({"detector__threshold": ...}, "detector.threshold: got nothing"),
     "a value that was not given": ({"source__steps": "???"}, "source.steps: got nothing"),
@@ -59,3 +62,8 @@ def test_mistake_is_named_before_the_first_frame(tmp_path, changes, sentence):
         run(config(**changes), tmp_path / "run")
     assert sentence in str(caught.value)
     assert not (tmp_path / "run").exists()
+
+
+def test_a_key_of_the_top_level_that_is_a_number_is_named():
+    with pytest.raises(ConfigError, match="the configuration: got 1, allowed: keys that are text"):
+        check_keys({**config(), 1: 2})

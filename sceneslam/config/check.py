@@ -73,13 +73,13 @@ NOTHING = _Nothing()
 
 
 def check_keys(config: Mapping[str, Any]) -> None:
-    """Raise ConfigError for an unknown top-level key or a value that was not given."""
+    """Raise ConfigError for an unknown top-level key, or what `check_given` refuses."""
+    check_given(config, "")
     for key in config:
         if key not in TOP_LEVEL:
             close = difflib.get_close_matches(key, (*TOP_LEVEL, "scenario", "experiment"), n=1)
             hint = f" (did you mean {close[0]}?)" if close else ""
             raise ConfigError(key, config[key], f"{', '.join(TOP_LEVEL)}{hint}")
-    check_given(config, "")
 
 
 def check_maps_apart(runs: Iterable[Mapping[str, Any]]) -> None:
@@ -183,10 +183,16 @@ def hints_of(target: Callable[..., object]) -> dict[str, Any]:
 
 
 def check_given(value: object, key: str) -> None:
-    """Raise ConfigError for a value at any depth that was not given (`???`)."""
+    """Raise ConfigError for a key that is not text, or a value not given (`???`), at any depth."""
     if isinstance(value, Mapping):
         for name, item in value.items():
-            check_given(item, f"{key}.{name}" if key else str(name))
+            if not isinstance(name, str):
+                allowed = "keys that are text, in quotes if necessary; decimals have a point"
+                raise ConfigError(key or "the configuration", name, allowed)
+            check_given(item, f"{key}.{name}" if key else name)
+    elif isinstance(value, list):
+        for index, item in enumerate(value):
+            check_given(item, f"{key}[{index}]")
     elif value == NOT_GIVEN:
         raise ConfigError(key, NOTHING, f"a value, as in {key}=...")
 
