@@ -13,7 +13,7 @@ from sceneslam.sources.contract.clean import cleaned
 from sceneslam.sources.faults import FaultLog
 from sceneslam.testing import RIG, room_observation
 from sceneslam.types.observation import Observation
-from sceneslam.types.rig import Sensor
+from sceneslam.types.rig import Camera, Laser, Lidar, Sensor
 
 SAMPLED = [sensor for sensor in Sensor if sensor.is_sampled]
 
@@ -61,3 +61,20 @@ def test_a_recording_keeps_gyro_and_accelerometer_apart(tmp_path, silent):
             else:
                 found = getattr(after, sensor.field)
                 np.testing.assert_allclose(found, getattr(before, sensor.field), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "intrinsics"),
+    [
+        (Camera, "T_base_cam", {"size_wh": (4, 3), "fx": 2.0, "fy": 2.0, "cx": 1.5, "cy": 1.0}),
+        (Laser, "T_base_laser", {}),
+        (Lidar, "T_base_lidar", {}),
+    ],
+)
+def test_where_a_sensor_is_mounted_cannot_be_changed_by_who_gets_the_rig(kind, name, intrinsics):
+    T_base_sensor = np.eye(4)
+    for sensor in (kind(**intrinsics), kind(**intrinsics, **{name: T_base_sensor})):
+        with pytest.raises(ValueError, match="read-only"):
+            getattr(sensor, name)[0, 3] = 1.0
+    T_base_sensor[0, 3] = 1.0
+    assert getattr(sensor, name)[0, 3] == 0.0

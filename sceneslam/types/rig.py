@@ -64,6 +64,9 @@ class Camera:
     depth_range_m: tuple[float, float] = (0.3, 8.0)  # depths outside are missing
     T_base_cam: Transform = field(default_factory=optical_to_rep103)
 
+    def __post_init__(self) -> None:
+        _lock(self, "T_base_cam")
+
     @property
     def K(self) -> NDArray[np.float64]:
         """Return the (3, 3) intrinsic matrix [px]."""
@@ -87,6 +90,9 @@ class Laser:
 
     T_base_laser: Transform = field(default_factory=identity)
 
+    def __post_init__(self) -> None:
+        _lock(self, "T_base_laser")
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Lidar:
@@ -94,6 +100,9 @@ class Lidar:
 
     range_m: tuple[float, float] = (1.0, 100.0)
     T_base_lidar: Transform = field(default_factory=identity)
+
+    def __post_init__(self) -> None:
+        _lock(self, "T_base_lidar")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -148,3 +157,10 @@ class Rig:
     def odometry(self) -> Wheels | None:
         """Return the errors of the odometry, None without it."""
         return self.wheels if Sensor.ODOMETRY in self.sensors else None
+
+
+def _lock(sensor: Camera | Laser | Lidar, name: str) -> None:
+    """Replace a sensor's matrix by a read-only copy: all modules and sinks get the same rig."""
+    matrix = np.array(getattr(sensor, name))
+    matrix.flags.writeable = False
+    object.__setattr__(sensor, name, matrix)
