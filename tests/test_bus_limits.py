@@ -177,6 +177,15 @@ def test_a_failed_module_has_answered_no_later_observation(method):
     assert hold.answer is None and not hold.is_trusted
 
 
+def test_a_module_that_changes_the_matrix_it_is_given_does_not_move_its_frame():
+    module = ExactModule()
+    runner = Runner("bright", module, InStep())
+    runner.start(RIG, "Bright")
+    module.set_pose = lambda T_map_local: T_map_local.fill(7.0)
+    runner.place(se3.identity())
+    np.testing.assert_array_equal(runner.T_map_local, np.eye(4))
+
+
 @pytest.mark.parametrize("row", [0, 2, 3, 5])
 def test_a_pose_is_unusually_uncertain_from_twice_the_median_deviation_on(row):
     for factor, is_usual in ((1.999, True), (2.001, False)):

@@ -101,7 +101,7 @@ class Runner:
         """Set T_map_local (4, 4), which places the module's frame in the map."""
         self.T_map_local = T_map_local
         with self._timed(), self._asking("could not be placed"):
-            self._module.set_pose(T_map_local)
+            self._module.set_pose(T_map_local.copy())
 
     def set_scene(self, scene: str) -> None:
         """Inform the running module of a newly confirmed scene."""
