@@ -125,3 +125,11 @@ class Fails(IdleSink):
         if name == object.__getattribute__(self, "_method"):
             return lambda *arguments: throw("Exception")
         return object.__getattribute__(self, name)
+
+
+class Clears(IdleSink):
+    """Empties every event that it is given, and what is in it."""
+
+    def write_event(self, event):
+        event["posterior"].clear()
+        event.clear()

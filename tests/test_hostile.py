@@ -5,6 +5,7 @@ import re
 import threading
 import time
 from contextlib import suppress
+from copy import deepcopy
 from pathlib import Path
 
 import hostile
@@ -12,12 +13,14 @@ import numpy as np
 import pytest
 from configured import config
 from driving import assert_exact, dark_from, drive, events
-from fakes import ExactModule, IdleSink, LiveFeedSource
+from fakes import RIG, ExactModule, IdleSink, LiveFeedSource
+from hostile_parts import Clears
 from isolation import isolating
 from test_isolation import active, drive_into, seen
 
 from sceneslam.app import run
 from sceneslam.atlas.atlas import Atlas
+from sceneslam.engine.open_sinks import OpenSinks
 from sceneslam.modules.detectors.grey_mean import GreyMean
 from sceneslam.types.errors import ConfigError, InputError, ModuleError
 
@@ -187,6 +190,14 @@ def test_a_sink_that_fails_is_closed(tmp_path, monkeypatch, method):
     tape = {"_target_": "hostile_parts.Fails", "method": method}
     run(hostile_config(sinks={"tape": tape}), tmp_path)
     assert len(closed) == 1
+
+
+def test_a_sink_that_changes_its_events_does_not_change_those_of_the_run(tmp_path):
+    event = {"event": "vote", "stamp_ns": 0, "posterior": {"Dark": 1.0}}
+    before, sinks = deepcopy(event), OpenSinks([])
+    sinks.open({"tape": Clears()}, RIG, tmp_path)
+    sinks.write_events([event])
+    assert event == before
 
 
 def hostile_config(**changes):

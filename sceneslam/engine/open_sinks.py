@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -82,11 +83,11 @@ class OpenSinks:
                 self._drop(key, error)
 
     def write_events(self, events: Sequence[Event]) -> None:
-        """Pass events to all sinks."""
+        """Pass events to all sinks, to each a copy of its own."""
         for key, sink in list(self._sinks.items()):
             try:
                 for event in events:
-                    sink.write_event(event)
+                    sink.write_event(deepcopy(event))
             except Exception as error:
                 self._drop(key, error)
 
