@@ -16,6 +16,7 @@ from sceneslam.config.resolve import resolved
 from sceneslam.config.words import check_trust, how_to_quote, quoted, readable
 from sceneslam.storage.folder import RunFolder, give_back
 from sceneslam.types.errors import ConfigError, SceneSlamError
+from sceneslam.types.input_files import given_path
 
 _STAMPED = "outputs/%Y-%m-%d/%H-%M-%S"
 
@@ -38,7 +39,7 @@ def run(
         raise ConfigError("experiment", config["experiment"], "null: use python -m sceneslam")
     check_no_reference(config, "in a script: use python -m sceneslam")
     is_stamped = folder is None
-    path = Path(datetime.now().strftime(_STAMPED)) if folder is None else Path(folder)
+    path = Path(datetime.now().strftime(_STAMPED)) if folder is None else given_path(str(folder))
     with closing(RunFolder.claim(path, is_stamped=is_stamped)) as claimed:
         try:
             return app.run(config, claimed.path, title=_title(overrides))

@@ -8,8 +8,10 @@ from pathlib import Path
 
 import pytest
 from configured import config
+from omegaconf import OmegaConf
 
 from sceneslam.app import run
+from sceneslam.config.claim import ClaimFolder
 from sceneslam.sinks.foxglove import FoxgloveSink
 from sceneslam.sinks.mcap import McapSink
 from sceneslam.sinks.ros2.sink import Ros2Sink
@@ -117,6 +119,14 @@ def test_a_mistake_leaves_no_folder(tmp_path, changes, error):
     with pytest.raises(error):
         run(config(**changes), tmp_path / "a" / "b")
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("kind", ["run", "sweep"])
+def test_a_folder_below_the_home_folder_is_made_there(tmp_path, monkeypatch, kind):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    composed = OmegaConf.create({"hydra": {kind: {"dir": "~/out"}}})
+    ClaimFolder()._claim(composed, kind)
+    assert composed.hydra[kind].dir == str(tmp_path / "out") and (tmp_path / "out" / MARK).exists()
 
 
 def test_a_mistake_removes_no_folder_that_was_there(tmp_path):

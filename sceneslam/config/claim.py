@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 from typing import Any
 
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
 from sceneslam.storage.folder import RunFolder
-from sceneslam.types.errors import ConfigError
+from sceneslam.types.errors import SceneSlamError
+from sceneslam.types.input_files import given_path
 
 _UNUSABLE = 2  # exit code: nothing was run
 
@@ -36,9 +36,9 @@ class ClaimFolder(Callback):
         raw = str(OmegaConf.to_container(node, resolve=False)["dir"])  # type: ignore[index,call-overload]
         try:
             self._folder = RunFolder.claim(
-                Path(node.dir), kind=kind, is_stamped="${now:" in raw, key=key
+                given_path(str(node.dir)), kind=kind, is_stamped="${now:" in raw, key=key
             )
-        except ConfigError as error:
+        except SceneSlamError as error:
             sys.stderr.write(f"error: {error}\n")
             raise SystemExit(_UNUSABLE) from error
         with read_write(config), open_dict(config):
