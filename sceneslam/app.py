@@ -82,7 +82,7 @@ def run(
                 raise
             with stop_requests(lambda: _log.warning(_ANSWER, folder)) as requests:
                 with suppress(KeyboardInterrupt):  # after the last observation
-                    loop.run()
+                    loop.run(lambda: requests.is_any)
                     requests.end_run()
                 try:
                     return _end(loop, results, reference, requests)

@@ -100,11 +100,14 @@ class RunLoop:
             self._sinks.open(parts.sinks, parts.rig, results.folder)
             opened.pop_all()
 
-    def run(self) -> None:
-        """Process all observations; an error or Ctrl-C ends the run, not the program."""
+    def run(self, is_stopped: Callable[[], bool]) -> None:
+        """Process all observations; an error or Ctrl-C ends the run, not the program.
+
+        `is_stopped` tells whether that was asked for: a module may have caught the Ctrl-C.
+        """
         try:
             self._survey()
-            self._feed()
+            self._feed(is_stopped)
         except StepInterrupt:
             self.is_interrupted = self._is_stepping = True
         except KeyboardInterrupt:
@@ -211,7 +214,7 @@ class RunLoop:
         if self._say is not None:
             self._say("\n".join([*checked.lines, *(f"warning: {one}" for one in checked.warnings)]))
 
-    def _feed(self) -> None:
+    def _feed(self, is_stopped: Callable[[], bool]) -> None:
         source = self._parts.source
         observations = islice(source, self._parts.run.max_observations)
         if isinstance(source, Live) and source.live is not None:
@@ -229,6 +232,8 @@ class RunLoop:
             for observation in chain([first], observations):
                 if not self._step(observation):
                     return
+                if is_stopped():
+                    raise KeyboardInterrupt
 
     def _run_live(self, observations: Iterator[Observation], feed: LiveFeed | None) -> None:
         try:

@@ -5,10 +5,12 @@ import signal
 import subprocess
 import sys
 import threading
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 from configured import config
+from fakes import ExactModule
 from tqdm import tqdm
 
 from sceneslam.app import run
@@ -97,6 +99,20 @@ def test_ctrl_c_pressed_twice_ends_the_run_once_and_saves_it(tmp_path, pressing,
 def test_ctrl_c_that_ends_what_hangs_at_the_end_of_a_run_costs_no_result(tmp_path, pressing):
     pressing(Keeping, "keep", signal.SIGINT)
     pressing(tqdm, "close", signal.SIGINT, signal.SIGINT)
+    finished = run(config(run__report=False), tmp_path)
+    assert finished.is_interrupted
+    assert len(Trajectory.read_tum(tmp_path / "trajectory.tum")) == 1
+
+
+def test_a_module_that_catches_the_request_to_stop_does_not_keep_the_run(tmp_path, monkeypatch):
+    track = ExactModule.track
+
+    def deaf(self, observation):
+        with suppress(BaseException):
+            signal.raise_signal(signal.SIGTERM)
+        return track(self, observation)
+
+    monkeypatch.setattr(ExactModule, "track", deaf)
     finished = run(config(run__report=False), tmp_path)
     assert finished.is_interrupted
     assert len(Trajectory.read_tum(tmp_path / "trajectory.tum")) == 1

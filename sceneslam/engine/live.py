@@ -112,9 +112,11 @@ class _LiveRun:
         self._behind_s = self._told_behind_s = 0.0  # delay of playback
 
     def carry_out(self) -> LiveTally:
-        source = threading.Thread(target=self._guard, args=(self._read,), name="source")
-        source.daemon = True  # a driver that hangs does not keep the program running
-        bus = threading.Thread(target=self._step_all, name="bus")
+        # A driver or a module that hangs does not keep the program running.
+        source = threading.Thread(
+            target=self._guard, args=(self._read,), name="source", daemon=True
+        )
+        bus = threading.Thread(target=self._step_all, name="bus", daemon=True)
         try:
             bus.start()
             source.start()  # no step before the bus is there to be waited for
