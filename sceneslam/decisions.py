@@ -16,6 +16,7 @@ from sceneslam.bus.decision import GO_ON, Situation, StandbyTrial, decide, in_js
 from sceneslam.bus.judging.hold import Health
 from sceneslam.bus.policy import Policy
 from sceneslam.config.component import ComponentBuilder
+from sceneslam.streams import secure_streams
 from sceneslam.types.errors import InputError, SceneSlamError
 from sceneslam.types.run import Event
 
@@ -107,4 +108,5 @@ def _read_policy(folder: Path) -> Policy:
 
 
 if __name__ == "__main__":
+    secure_streams()
     sys.exit(main())

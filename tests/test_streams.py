@@ -1,5 +1,6 @@
 """Standard output and error that are closed, hung up on or full: they cost their text alone."""
 
+import json
 import subprocess
 import sys
 
@@ -44,3 +45,23 @@ def test_what_a_terminal_cannot_show_is_no_error():
     words = [sys.executable, "-c", "from sceneslam.streams import *\nsecure_streams()\nprint('–')"]
     done = subprocess.run(words, capture_output=True, env={"PYTHONIOENCODING": "ascii"}, check=True)
     assert done.stdout == b"\\u2013\n"
+
+
+def test_a_sweep_is_continued_without_a_reader(tmp_path):
+    (tmp_path / ".sweep").mkdir()
+    kept = {"launcher": {"backend": "basic"}, "began_in": str(tmp_path), "jobs": ["0"]}
+    (tmp_path / ".sweep" / "sweep.json").write_text(json.dumps(kept))
+    (tmp_path / "0").mkdir()
+    (tmp_path / "0" / "job.json").write_text('{"state": "waiting"}')
+    script = '"$0" -m sceneslam.sweep "$1" >&- 2>/dev/full'
+    words = ["bash", "-c", script, sys.executable, str(tmp_path)]
+    assert subprocess.run(words, check=False).returncode == 1
+    assert (tmp_path / "table.csv").is_file()
+
+
+@pytest.mark.parametrize("name", ["collect", "decisions", "evaluation", "scenes", "sweep"])
+def test_a_program_that_cannot_say_what_is_wrong_ends_as_usual(tmp_path, name):
+    arguments = {"evaluation": ["ate", "no", "no"], "scenes": ["label", "new", "no", "no"]}
+    said = [sys.executable, "-m", f"sceneslam.{name}", *arguments.get(name, ["no"])]
+    words = ["bash", "-c", '"$0" "$@" >/dev/full 2>/dev/full', *said]
+    assert subprocess.run(words, cwd=tmp_path, check=False).returncode == 2

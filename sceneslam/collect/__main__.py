@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sceneslam.collect.write import collect
+from sceneslam.streams import secure_streams
 from sceneslam.types.errors import InputError
 
 
@@ -26,4 +27,5 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
+    secure_streams()
     sys.exit(main())

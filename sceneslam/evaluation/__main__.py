@@ -11,6 +11,7 @@ from pathlib import Path
 from sceneslam.evaluation.accuracy import absolute_errors, relative_errors, root_mean_square
 from sceneslam.evaluation.files import has_stamps, read_poses
 from sceneslam.evaluation.relations import Relations, relation_errors
+from sceneslam.streams import secure_streams
 from sceneslam.types.errors import ConfigError, InputError, SceneSlamError
 
 
@@ -79,4 +80,5 @@ def _parser() -> argparse.ArgumentParser:
 
 
 if __name__ == "__main__":
+    secure_streams()
     sys.exit(main())

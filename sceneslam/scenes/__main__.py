@@ -25,6 +25,7 @@ from sceneslam.scenes.runs import read_runs
 from sceneslam.scenes.score import table, write_sheet
 from sceneslam.scenes.train import Judged, Trained, judge, train
 from sceneslam.scenes.words import read_words
+from sceneslam.streams import secure_streams
 from sceneslam.types.errors import InputError, SceneSlamError, text_of
 
 # The upper half of grey values depends on the light, the lower half on shadows.
@@ -181,4 +182,5 @@ def _parser() -> argparse.ArgumentParser:
 
 
 if __name__ == "__main__":
+    secure_streams()
     sys.exit(main())

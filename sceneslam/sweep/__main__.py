@@ -6,6 +6,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from sceneslam.streams import secure_streams
 from sceneslam.sweep.sweep import resume
 from sceneslam.types.errors import SceneSlamError
 
@@ -24,4 +25,5 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
+    secure_streams()
     sys.exit(main())
