@@ -118,12 +118,14 @@ class Votes:
 class Fails(IdleSink):
     """Fails in one of its methods."""
 
-    def __init__(self, method):
-        self._method = method
+    def __init__(self, method, error="Exception"):
+        self._method, self._error = method, error
+        if method == "__init__":
+            throw(error)
 
     def __getattribute__(self, name):
         if name == object.__getattribute__(self, "_method"):
-            return lambda *arguments: throw("Exception")
+            return lambda *arguments: throw(object.__getattribute__(self, "_error"))
         return object.__getattribute__(self, name)
 
 

@@ -25,6 +25,9 @@ from sceneslam.modules.detectors.grey_mean import GreyMean
 from sceneslam.types.errors import ConfigError, InputError, ModuleError
 
 ERRORS = sorted(hostile.ERRORS.keys() - {"KeyboardInterrupt"})  # that one ends the run
+RAISED = pytest.mark.parametrize(
+    ("error", "said"), [("Exception", "Exception: as usual"), ("SystemExit", "SystemExit: 3")]
+)
 SOUND = {"covariance huge"}  # it may be so
 
 
@@ -126,10 +129,17 @@ def test_a_source_that_talks_nonsense_ends_what_it_spoils_and_no_more(tmp_path, 
     assert any(what in fault for fault in finished.faults) or not what
 
 
-def test_a_sink_that_cannot_be_opened_is_named_before_the_first_frame(tmp_path):
-    sinks = {"tape": {"_target_": "hostile_parts.Fails", "method": "open"}}
-    with pytest.raises(InputError, match=r"sinks\.tape could not be opened: Exception: as usual"):
-        run(hostile_config(sinks=sinks), tmp_path)
+@RAISED
+def test_a_sink_that_cannot_be_opened_is_named_before_the_first_frame(tmp_path, error, said):
+    tape = {"_target_": "hostile_parts.Fails", "method": "open", "error": error}
+    with pytest.raises(InputError, match=rf"sinks\.tape could not be opened: {said}"):
+        run(hostile_config(sinks={"tape": tape}), tmp_path)
+
+
+def test_a_component_that_leaves_while_it_is_built_is_named(tmp_path):
+    tape = {"_target_": "hostile_parts.Fails", "method": "__init__", "error": "SystemExit"}
+    with pytest.raises(ConfigError, match=r"sinks\.tape: .* builds \(SystemExit: 3\)"):
+        run(hostile_config(sinks={"tape": tape}), tmp_path)
 
 
 def test_a_sink_that_cannot_be_opened_leaves_nothing_open(tmp_path, monkeypatch):
@@ -176,11 +186,12 @@ def test_a_detector_that_cannot_be_activated_leaves_no_thread(tmp_path):
 
 
 @pytest.mark.parametrize("method", ["write", "write_event", "write_truth", "close"])
-def test_a_sink_that_fails_is_dropped(tmp_path, method):
-    sinks = {"tape": {"_target_": "hostile_parts.Fails", "method": method}}
-    finished = run(hostile_config(sinks=sinks), tmp_path)
-    assert finished.faults == ("sinks.tape stopped writing: Exception: as usual",)
-    assert len(finished.trajectory) == 100
+@RAISED
+def test_a_sink_that_fails_is_dropped(tmp_path, method, error, said):
+    tape = {"_target_": "hostile_parts.Fails", "method": method, "error": error}
+    finished = run(hostile_config(sinks={"tape": tape}), tmp_path)
+    assert finished.faults == (f"sinks.tape stopped writing: {said}",)
+    assert len(finished.trajectory) == 100 and (tmp_path / "map").is_dir()
 
 
 @pytest.mark.parametrize("method", ["write", "write_event", "write_truth"])

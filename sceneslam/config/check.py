@@ -15,7 +15,7 @@ from importlib.metadata import packages_distributions
 from pathlib import Path
 from typing import Any
 
-from sceneslam.types.errors import ConfigError
+from sceneslam.types.errors import ConfigError, text_of
 from sceneslam.types.input_files import given_path
 from sceneslam.types.run import Command
 
@@ -210,7 +210,7 @@ def locate(target: object, key: str, allow: Sequence[str]) -> Callable[..., obje
     module, _, name = target.rpartition(".")
     try:
         found = pkgutil.resolve_name(f"{_MOVED.get(module, module)}.{name}")
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         reason = first_line(error)
         raise ConfigError(key, target, f"a class that can be imported ({reason})") from error
     if not inspect.isclass(found) and not inspect.isfunction(found):
@@ -233,8 +233,9 @@ def _how_to_allow(target: str) -> str:
 
 
 def first_line(error: BaseException) -> str:
-    """Return the first line of an error's message."""
-    return next(iter(str(error).strip().splitlines()), type(error).__name__)
+    """Return the first line of an error's message; a program's exit code has its type before it."""
+    said = text_of(error) if isinstance(error, SystemExit) else str(error)
+    return next(iter(said.strip().splitlines()), type(error).__name__)
 
 
 def fits(value: object, hint: Any) -> bool:

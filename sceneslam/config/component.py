@@ -63,7 +63,7 @@ class ComponentBuilder:
             raise error.under(key) from error
         except SceneSlamError:
             raise
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             reason = first_line(error)
             raise ConfigError(key, node["_target_"], f"a target that builds ({reason})") from error
 

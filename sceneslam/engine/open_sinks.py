@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from copy import deepcopy
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -13,14 +13,12 @@ from numpy.typing import NDArray
 
 from sceneslam.interfaces import CovarianceSink, ResultSink, Sink, Steering
 from sceneslam.types.command import Command
-from sceneslam.types.errors import InputError, text_of
+from sceneslam.types.errors import InputError, calling
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig
 from sceneslam.types.run import Event, RunResult
 from sceneslam.types.se3 import Transform
 from sceneslam.types.truth import GroundTruth
-
-_log = logging.getLogger(__name__)
 
 
 @runtime_checkable
@@ -49,21 +47,16 @@ class OpenSinks:
         # Who steers a robot waits for poses; files do not.
         for key, sink in sorted(sinks.items(), key=lambda one: not isinstance(one[1], Steering)):
             self._sinks[key] = sink
-            try:
+            with calling(f"sinks.{key} could not be opened", InputError):
                 sink.open(rig, folder)
-            except Exception as error:
-                _log.info("sinks.%s", key, exc_info=error)
-                raise InputError(f"sinks.{key} could not be opened: {text_of(error)}") from error
 
     def commands(self) -> Sequence[Command]:
         """Return the operators' commands since the last call."""
         commands: list[Command] = []
         for key, sink in list(self._sinks.items()):
-            try:
+            with self._dropping(key):
                 if isinstance(sink, Steering):
                     commands += sink.commands()
-            except Exception as error:
-                self._drop(key, error)
         return commands
 
     def write(
@@ -75,53 +68,51 @@ class OpenSinks:
     ) -> None:
         """Pass an observation with its pose (4, 4) and covariance (6, 6)."""
         for key, sink in list(self._sinks.items()):
-            try:
+            with self._dropping(key):
                 if isinstance(sink, CovarianceSink) and covariance is not None:
                     sink.write_covariance(observation.stamp_ns, covariance)
                 sink.write(observation, T_map_base, module)
-            except Exception as error:
-                self._drop(key, error)
 
     def write_events(self, events: Sequence[Event]) -> None:
         """Pass events to all sinks, to each a copy of its own."""
         for key, sink in list(self._sinks.items()):
-            try:
+            with self._dropping(key):
                 for event in events:
                     sink.write_event(deepcopy(event))
-            except Exception as error:
-                self._drop(key, error)
 
     def close(self, truth: GroundTruth | None, result: Callable[[], RunResult]) -> None:
         """Pass the ground truth and the final results to the sinks, and close them."""
         for key, sink in list(self._sinks.items()):
-            try:
+            with self._dropping(key):
                 if truth is not None:
                     sink.write_truth(truth)
                 if isinstance(sink, ResultSink):
                     sink.write_result(result())
                 sink.close()
-            except Exception as error:
-                self._drop(key, error)
 
     def drop_files(self, error: Exception) -> None:
         """Remove and close the sinks that write files because of an error."""
         for key, sink in list(self._sinks.items()):
             if not isinstance(sink, SinkWithFiles) or sink.writes_files:
-                self._drop(key, error)
+                with self._dropping(key):
+                    raise error
 
     def abandon(self) -> None:
         """Close all sinks without results."""
         for key in list(self._sinks):
             self._abandon(key)
 
-    def _drop(self, key: str, error: Exception) -> None:
-        _log.info("sinks.%s", key, exc_info=error)
-        self._faults.append(f"sinks.{key} stopped writing: {text_of(error)}")
-        self._abandon(key)
+    @contextmanager
+    def _dropping(self, key: str) -> Iterator[None]:
+        """Remove a sink that raises an error within, which is a fault of the run."""
+        try:
+            with calling(f"sinks.{key} stopped writing", InputError):
+                yield
+        except InputError as error:
+            self._faults.append(str(error))
+            self._abandon(key)
 
     def _abandon(self, key: str) -> None:
         """Close a sink, without an error if that fails."""
-        try:
+        with suppress(InputError), calling(f"sinks.{key} could not be closed", InputError):
             self._sinks.pop(key).close()
-        except Exception as error:
-            _log.info("sinks.%s", key, exc_info=error)

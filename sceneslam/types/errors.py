@@ -50,8 +50,8 @@ def text_of(error: BaseException) -> str:
 
 
 @contextmanager
-def calling(what: str) -> Iterator[None]:
-    """Raise any exception of a plug-in, which is called within, as ModuleError; Ctrl-C passes."""
+def calling(what: str, kind: type[SceneSlamError] = ModuleError) -> Iterator[None]:
+    """Raise any exception of a plug-in, which is called within, as `kind`; Ctrl-C passes."""
     try:
         yield
     except KeyboardInterrupt:
@@ -59,4 +59,4 @@ def calling(what: str) -> Iterator[None]:
     except BaseException as error:
         sentence = f"{what}: {text_of(error)}"
         _log.info(sentence, exc_info=error)
-        raise ModuleError(sentence) from error
+        raise kind(sentence) from error
