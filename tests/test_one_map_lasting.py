@@ -197,6 +197,14 @@ def test_a_folder_that_holds_other_files_is_refused(tmp_path):
         atlas(save=str(tmp_path))
 
 
+@pytest.mark.parametrize("folder", ["/proc/map", "{tmp_path}/maps/" + 300 * "m"])
+def test_a_folder_that_cannot_be_made_is_refused_before_the_run(tmp_path, folder):
+    with pytest.raises(ConfigError, match="it cannot be made in"):
+        atlas(save=folder.format(tmp_path=tmp_path))
+    atlas(save=str(tmp_path / "maps" / "map"))
+    assert not list(tmp_path.iterdir())
+
+
 def damaged(folder, tmp_path, harm):
     copy = tmp_path / "map"
     copy.mkdir()

@@ -16,6 +16,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -35,7 +36,7 @@ _ARRAYS = "arrays-"  # prefix, followed by the start of their checksum
 def check_map_folder(folder: Path) -> None:
     """Raise InputError if a map cannot be saved in a folder: it holds something else.
 
-    Nor in a folder of another map, which could not be saved again.
+    Nor in a folder that cannot be made, nor in that of another map, which could not be saved again.
     """
     if seal_of(folder.absolute().parent) is not None:
         raise InputError(f"a map is saved in a folder of its own, not in another map: {folder}")
@@ -43,8 +44,11 @@ def check_map_folder(folder: Path) -> None:
         there = next(path for path in (folder, *folder.parents) if os.path.lexists(path))
         if not there.is_dir():
             raise InputError(f"there is a file in the place of a folder: {there}")
-        if not os.access(there, os.W_OK | os.X_OK):
-            raise InputError(f"the folder may not be written: {there}")
+        try:
+            with TemporaryDirectory(dir=there) as within:  # a permission alone does not tell
+                (Path(within) / folder.relative_to(there)).mkdir(parents=True)
+        except OSError as error:
+            raise InputError(f"it cannot be made in {there}: {error.strerror}") from error
         return
     if not os.access(folder, os.W_OK | os.X_OK):
         raise InputError(f"the folder may not be written: {folder}")
