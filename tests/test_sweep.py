@@ -7,6 +7,7 @@ import json
 import os
 import re
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -365,6 +366,23 @@ def test_a_sweep_whose_file_is_damaged_is_named(tmp_path, capsys, text):
     assert main([str(tmp_path)]) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: the sweep's file is damaged") and "sweep.json" in error
+
+
+@pytest.mark.parametrize("is_deleted", [True, False])
+def test_a_job_that_is_deleted_or_empty_is_named_and_run_by_the_same_command(
+    folder, capsys, is_deleted
+):
+    words = (*JOBS, "policy.retry_s=0", "hydra.sweep.dir=out")
+    assert sweep(folder, *words)[0] == 0
+    if is_deleted:
+        shutil.rmtree(folder / "out" / "0")
+    else:
+        (folder / "out" / "0" / "job.json").write_text("")
+    assert main([str(folder / "out")]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: a job's folder or status is missing (give the sweep's command")
+    code, out, errors = sweep(folder, *words)
+    assert code == 0 and "1 jobs: 1 done" in out, errors
 
 
 def test_the_file_of_a_sweep_is_replaced_whole_or_not_at_all(tmp_path, monkeypatch):

@@ -78,9 +78,9 @@ class Status:
 
     @classmethod
     def read(cls, folder: Path) -> Status | None:
-        """Return a folder's status, None if it is not a job of a sweep."""
+        """Return a folder's status, None if it is not a job of a sweep or its file is empty."""
         path = folder / _FILE
-        if not path.is_file():
+        if not path.is_file() or not path.stat().st_size:
             return None
         try:
             values = json.loads(path.read_text())

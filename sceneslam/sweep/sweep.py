@@ -77,6 +77,10 @@ def resume(sweep: Path) -> bool:
         folders = [sweep / str(name) for name in kept["jobs"]]
     except (ValueError, TypeError, KeyError) as error:
         raise InputError(f"the sweep's file is damaged ({text_of(error)}): {path}") from error
+    for folder in folders:
+        if Status.read(folder) is None:
+            how = f"give the sweep's command again, with hydra.sweep.dir={sweep}"
+            raise InputError(f"a job's folder or status is missing ({how}): {folder}")
     return run_sweep(sweep, folders, launcher, began_in)
 
 
