@@ -59,7 +59,7 @@ def test_poses_that_are_missing_are_a_shortfall_with_its_reason(tmp_path):
 def test_poses_that_a_reference_lacks_are_told(tmp_path, monkeypatch):
     hydra = SimpleNamespace(
         runtime=SimpleNamespace(choices={}, output_dir=str(tmp_path)),
-        overrides=SimpleNamespace(task=["allow_targets=[fakes]"]),
+        overrides=SimpleNamespace(task=OmegaConf.create(["allow_targets=[fakes]"])),
     )
     monkeypatch.setattr("sceneslam.cli.HydraConfig.get", lambda: hydra)
     lost = {"slam": {"only": {"lost": list(range(8, 100))}}}
