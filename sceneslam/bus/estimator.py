@@ -75,7 +75,8 @@ class Estimator:
             if session.suspicion is not None and session.is_acquitted:
                 moment = self._acquit(session.suspicion, moment)
             elif not was_placed:
-                self._begin_session(moment.stamp_ns, moment.stamp_ns, jump=se3.identity())
+                now_ns = moment.stamp_ns
+                self._begin_session(now_ns, now_ns, posed_ns=now_ns, jump=se3.identity())
             session.suspicion = None
             self._back_end.add_local(moment.stamp_ns, session.tracking.T_local_base)
         self._report(moment)
@@ -197,25 +198,24 @@ class Estimator:
     def _rewrite(self, handover: Handover) -> None:
         """Replace the untrusted poses by those of a module that has caught up."""
         newest, trail = self._memory.newest, handover.trail
-        before, known = newest.T_map_base, (handover.trail or [handover.anchor])[-1].T_map_base
+        before, known = newest.T_map_base, (trail or [handover.anchor])[-1].T_map_base
         jump = se3.identity() if before is None or known is None else se3.inverse(before) @ known
         if trail:
             self._back_end.rewind(trail[0].stamp_ns)
         from_ns = handover.tracked[0].stamp_ns
-        posed_ns = next((one.stamp_ns for one in trail if one.T_map_base is not None), from_ns)
-        posed_ns = min(posed_ns, from_ns)
-        self._begin_session(newest.stamp_ns, from_ns, jump=jump, posed_ns=posed_ns)
+        posed_ns = min([from_ns, *(one.stamp_ns for one in trail if one.T_map_base is not None)])
+        self._begin_session(newest.stamp_ns, from_ns, posed_ns=posed_ns, jump=jump)
         for tracking in handover.tracked:
             self._back_end.add_local(tracking.stamp_ns, tracking.T_local_base)
-        self._put(handover.trail, newest.stamp_ns)
+        self._put(trail, newest.stamp_ns)
         self.session.bridge = self._memory.newest.bridge.copy()
 
     def _begin_session(
-        self, stamp_ns: int, from_ns: int, *, jump: Transform, posed_ns: int | None = None
+        self, stamp_ns: int, from_ns: int, *, posed_ns: int, jump: Transform
     ) -> None:
         """Open the active module's session in the back end; it begins at `from_ns`.
 
-        Its first pose, bridged or not, has the stamp `posed_ns`, `from_ns` if it is not given.
+        Its first pose, bridged or not, has the stamp `posed_ns`.
         `jump` is the transform from the pose reported at `stamp_ns` to the corrected one.
         """
         assert self.active is not None and self.active.T_map_local is not None
@@ -232,7 +232,7 @@ class Estimator:
             T_map_local=T_map_local.tolist(),
             jump_m=float(np.linalg.norm(jump[:3, 3])),
             jump_rad=float(se3.rotation_angle_rad(jump)),
-            gap_s=0.0 if last_ns is None else ((posed_ns or from_ns) - last_ns) / 1e9,
+            gap_s=0.0 if last_ns is None else (posed_ns - last_ns) / 1e9,
         )
 
     def _tell(self, stamp_ns: int) -> None:

@@ -117,9 +117,7 @@ class Handover:
         if self._reported is not None:
             self._reported = T_new_old @ self._reported
         for moment in self.trail:
-            if moment.T_map_base is not None:
-                moment.T_map_base = T_new_old @ moment.T_map_base
-            moment.bridge = moment.bridge.moved(T_new_old)
+            moment.move(T_new_old)
         if session.is_placed:
             assert self.runner.T_map_local is not None
             self.runner.place(T_new_old @ self.runner.T_map_local)

@@ -44,6 +44,12 @@ class BufferedObservation:
         """Return what is known of the odometry, for a module that gets the observation later."""
         return Witness(missed_rad=self.missed_rad, is_vouched=self.is_trusted and self.vouches)
 
+    def move(self, T_new_old: Transform) -> None:
+        """Move the pose by the correction (4, 4) of the map."""
+        if self.T_map_base is not None:
+            self.T_map_base = T_new_old @ self.T_map_base
+        self.bridge = self.bridge.moved(T_new_old)
+
 
 def bridged(
     before: BufferedObservation, moments: Sequence[BufferedObservation]
@@ -138,9 +144,7 @@ class ObservationBuffer:
     def move(self, T_new_old: Transform, after_ns: int) -> None:
         """Move the poses after a stamp by the correction (4, 4) of the map."""
         for moment in self.after(after_ns):
-            if moment.T_map_base is not None:
-                moment.T_map_base = T_new_old @ moment.T_map_base
-            moment.bridge = moment.bridge.moved(T_new_old)
+            moment.move(T_new_old)
 
     def clear(self) -> None:
         """Remove all entries, to free memory when a finished run is kept for its results."""
