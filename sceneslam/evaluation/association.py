@@ -88,12 +88,9 @@ def interpolated(trajectory: Trajectory, stamps_ns: NDArray[np.int64]) -> Trajec
     right = np.clip(np.searchsorted(times, stamps_ns), min(1, len(times) - 1), len(times) - 1)
     left = np.maximum(right - 1, 0)
     span_ns = np.maximum(times[right] - times[left], 1)
-    ratio = ((stamps_ns - times[left]) / span_ns)[:, None]
-    positions = trajectory.positions_m
-    position_m = (1.0 - ratio) * positions[left] + ratio * positions[right]
-    quats_xyzw = se3.to_quat_xyzw(trajectory.T_world_base)
-    quat_xyzw = _slerp(quats_xyzw[left], quats_xyzw[right], ratio)
-    return Trajectory(stamps_ns=stamps_ns, T_world_base=se3.from_quat_xyzw(position_m, quat_xyzw))
+    ratio = (stamps_ns - times[left]) / span_ns
+    before, after = trajectory.T_world_base[left], trajectory.T_world_base[right]
+    return Trajectory(stamps_ns=stamps_ns, T_world_base=se3.interpolate(before, after, ratio))
 
 
 def _nearest_within(
@@ -104,17 +101,3 @@ def _nearest_within(
     partner = nearest(long_ns, short_ns)
     kept = np.flatnonzero(np.abs(long_ns[partner] - short_ns) <= round(max_gap_s * 1e9))
     return PosePairs(first=kept, second=partner[kept])
-
-
-def _slerp(
-    q0: NDArray[np.float64], q1: NDArray[np.float64], ratio: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    cosine = np.sum(q0 * q1, axis=-1, keepdims=True)
-    q1 = np.where(cosine < 0, -q1, q1)  # q and -q are the same rotation: take the shorter arc
-    angle = np.arccos(np.clip(np.abs(cosine), 0.0, 1.0))
-    sine = np.sin(angle)
-    straight = sine < 1e-9
-    sine = np.where(straight, 1.0, sine)
-    weight_0 = np.where(straight, 1.0 - ratio, np.sin((1.0 - ratio) * angle) / sine)
-    weight_1 = np.where(straight, ratio, np.sin(ratio * angle) / sine)
-    return np.asarray(weight_0 * q0 + weight_1 * q1)
