@@ -24,9 +24,9 @@ class Trail:
 
     def add(self, stamp_ns: int, T_w_base: Transform) -> None:
         """Go on to a pose (4, 4) [m]; what is known of its stamp or later is replaced."""
-        self._cut(bisect_left(self._stamps_ns, stamp_ns - _KEPT_NS), self._after(stamp_ns))
-        self._stamps_ns.append(stamp_ns)
-        self._poses.append(T_w_base)
+        kept = slice(self._count_before(stamp_ns - _KEPT_NS), self._count_before(stamp_ns))
+        self._stamps_ns = [*self._stamps_ns[kept], stamp_ns]
+        self._poses = [*self._poses[kept], T_w_base]
 
     def move(self, stamp_ns: int, T_prev_base: Transform) -> None:
         """Go on by the motion (4, 4) [m] to an observation."""
@@ -37,7 +37,7 @@ class Trail:
 
         Later than that it goes on as it moved last; the oldest one that is known is that before.
         """
-        after = self._after(stamp_ns)
+        after = self._count_before(stamp_ns)
         if after == len(self._poses):
             ahead_s = 0.0 if not self._stamps_ns else (stamp_ns - self._stamps_ns[-1]) * 1e-9
             return se3.exp(min(ahead_s, _AHEAD * self._step_s) * self.twist_s)
@@ -61,8 +61,5 @@ class Trail:
         last_ns = self._stamps_ns[-2:]
         return (last_ns[-1] - last_ns[0]) * 1e-9 if last_ns else 0.0
 
-    def _after(self, stamp_ns: int) -> int:
+    def _count_before(self, stamp_ns: int) -> int:
         return bisect_left(self._stamps_ns, stamp_ns)
-
-    def _cut(self, begin: int, end: int) -> None:
-        self._stamps_ns, self._poses = self._stamps_ns[begin:end], self._poses[begin:end]
