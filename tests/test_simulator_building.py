@@ -42,7 +42,7 @@ _CAMERA = CameraSettings(
     forward_m=0.0,
     tilt_deg=3.0,
 ).camera()
-_EXPOSURE = ExposureSettings(
+EXPOSURE = ExposureSettings(
     is_automatic=True,
     target_grey=120.0,
     lag_s=0.4,
@@ -85,9 +85,9 @@ def measured() -> dict[str, list[tuple[float, float]]]:
     for time_s in np.arange(0.0, tour().duration_s, 1.0 / _RATE_HZ).tolist():
         T_gt_base = tour().pose(time_s)
         view = eye.look(T_gt_base @ _CAMERA.T_base_cam, levels)
-        most = _EXPOSURE.range_s[1] / _EXPOSURE.nominal_s
-        lit = (_EXPOSURE.target_grey / max(float(view.image_bgr.mean()), 1.0)) ** 2
-        time_ratio, gain = split(min(lit, most), _EXPOSURE)
+        most = EXPOSURE.range_s[1] / EXPOSURE.nominal_s
+        lit = (EXPOSURE.target_grey / max(float(view.image_bgr.mean()), 1.0)) ** 2
+        time_ratio, gain = split(min(lit, most), EXPOSURE)
         rng = np.random.default_rng(0)
         image = expose(view, noise, rng, Shutter(time_ratio=time_ratio, gain=gain))
         depth_mm = measure_depth(view, _CAMERA, noise, rng)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from test_simulator_building import EXPOSURE
 
 from sceneslam.sources.simulator.optics.camera import CameraRenderer
 from sceneslam.sources.simulator.optics.lighting import LightMap
@@ -28,7 +29,6 @@ from sceneslam.sources.simulator.robot.motion import (
 from sceneslam.sources.simulator.robot.wheels import SimulatedGyro, WheelOdometry
 from sceneslam.sources.simulator.settings import (
     CameraSettings,
-    ExposureSettings,
     GyroSettings,
     OdometrySettings,
 )
@@ -47,14 +47,6 @@ _CAMERA = CameraSettings(
     forward_m=0.0,
     tilt_deg=3.0,
 ).camera()
-_EXPOSURE = ExposureSettings(
-    is_automatic=True,
-    target_grey=120.0,
-    lag_s=0.4,
-    nominal_s=0.01,
-    range_s=(0.0001, 0.02),
-    gain_max=1.0,
-)
 _CHANGES = {
     "bright_to_dark": ["Bright", "Dark"],
     "dark_to_bright": ["Dark", "Bright"],
@@ -253,7 +245,7 @@ def test_each_frame_is_metered_in_its_own_light() -> None:
         scanner=None,
         place=place,
         light=light_place(place, seed=0),
-        exposure=_EXPOSURE,
+        exposure=EXPOSURE,
         exposures=np.ones(60),
     )
     means = [float(grey.mean()) for grey in meter(shot, 60)]

@@ -63,6 +63,12 @@ def test_odometry_of_another_frame_is_brought_to_the_base(
     np.testing.assert_allclose(source.survey().T_odom_base[-1], poses[1])
 
 
+def add_placed_scan(recorder: Recorder) -> None:
+    tree = [recorder.transform("base_link", "laser", 0.5)]
+    recorder.add("/tf_static", 0, recorder.new("tf2_msgs/msg/TFMessage", transforms=tree))
+    recorder.scan("/scan", STAMP_NS, [1.0, 2.0])
+
+
 @pytest.mark.parametrize(
     ("child", "unplaced"),
     [("t265", ["t265"]), ("laser", []), ("base_footprint", []), ("husky/base_link", []), ("", [])],
@@ -71,9 +77,7 @@ def test_frame_of_odometry_that_no_transform_places_is_named(
     tmp_path: Path, child: str, unplaced: list[str]
 ) -> None:
     with Recorder(tmp_path / "a.mcap") as recorder:
-        tree = [recorder.transform("base_link", "laser", 0.5)]
-        recorder.add("/tf_static", 0, recorder.new("tf2_msgs/msg/TFMessage", transforms=tree))
-        recorder.scan("/scan", STAMP_NS, [1.0, 2.0])
+        add_placed_scan(recorder)
         recorder.add("/odom", STAMP_NS, odometry(recorder, STAMP_NS, np.eye(4), child))
     assert make_source("mcap", tmp_path / "a.mcap").survey().unplaced == unplaced
 
@@ -92,9 +96,7 @@ def test_body_of_the_truth_that_no_transform_places_is_named(
     tmp_path: Path, child: str, given: str | None, is_odd: bool
 ) -> None:
     with Recorder(tmp_path / "a.mcap") as recorder:
-        tree = [recorder.transform("base_link", "laser", 0.5)]
-        recorder.add("/tf_static", 0, recorder.new("tf2_msgs/msg/TFMessage", transforms=tree))
-        recorder.scan("/scan", STAMP_NS, [1.0, 2.0])
+        add_placed_scan(recorder)
         recorder.add("/ground_truth", STAMP_NS, odometry(recorder, STAMP_NS, np.eye(4), child))
     survey = make_source("mcap", tmp_path / "a.mcap", ground_truth_frame=given).survey()
     assert ["frame 'vicon'" in one for one in survey.odd] == [True] * is_odd
