@@ -65,8 +65,10 @@ def save_landmarks(hybrid: HybridMap, path: Path) -> None:
 
 
 def save_pose_graph(graph: PoseGraphLayer, path: Path) -> None:
-    """Write the graph as g2o, information in the order translation, rotation vector (as gtsam
-    reads it), and its vertices with their stamps as TUM beside it.
+    """Write the graph as g2o, and its vertices with their stamps as TUM beside it.
+
+    Information is in the order translation, rotation vector, as gtsam and Ceres read it; g2o itself
+    reads that of the quaternion's vector part, half the angle.
     """
     with replacing(path) as file:
         for row, numbers in enumerate(_quat_rows(graph.T_world_base)):
