@@ -108,10 +108,8 @@ class RunLoop:
         try:
             self._survey()
             self._feed(is_stopped)
-        except StepInterrupt:
-            self.is_interrupted = self._is_stepping = True
-        except KeyboardInterrupt:
-            self.is_interrupted = True
+        except KeyboardInterrupt as stop:
+            self.is_interrupted, self._is_stepping = True, isinstance(stop, StepInterrupt)
             self.faults.append(f"stopped after {len(self._observed_ns)} observations; saved so far")
         except InputError as error:
             self.faults.append(str(error))
@@ -123,9 +121,10 @@ class RunLoop:
     def finish(self) -> None:
         """Shut down everything but the sinks, in reverse order, and collect errors.
 
-        Raises KeyboardInterrupt if a step still runs, since nothing can be saved beside it.
+        Raises KeyboardInterrupt if a step still runs, since nothing can be saved beside it, unless
+        it waits for a module: that is left out.
         """
-        if self._is_stepping:
+        if self._is_stepping and not self._bus.leave_awaited(self._last_ns()):
             raise KeyboardInterrupt
         if self._bus.state == "terminate":
             self.faults.append(self._why_over())

@@ -123,6 +123,7 @@ def test_a_module_that_catches_the_request_to_stop_does_not_keep_the_run(tmp_pat
 def test_live_run_saves_nothing_beside_the_step_that_ctrl_c_interrupted(
     tmp_path, monkeypatch, times
 ):
+    monkeypatch.setattr("sceneslam.engine.live._RAISE_S", 0.0)
     keep, finish, is_left, order = Keeping.keep, Atlas.finish, threading.Event(), []
 
     def slow(self):
@@ -146,6 +147,29 @@ def test_live_run_saves_nothing_beside_the_step_that_ctrl_c_interrupted(
     with pytest.raises(KeyboardInterrupt, match=r"python -m sceneslam\.recover"):
         run(settings, tmp_path)
     assert "saves" not in order and not (tmp_path / "trajectory.tum").exists()
+
+
+@pytest.mark.usefixtures("heeds_ctrl_c")
+def test_live_run_is_saved_without_the_module_that_does_not_return(tmp_path, monkeypatch):
+    is_left, track = threading.Event(), ExactModule.track
+
+    def stuck(self, observation):
+        if observation.stamp_ns:
+            signal.pthread_kill(threading.main_thread().ident, signal.SIGTERM)
+            is_left.wait(60.0)
+        return track(self, observation)
+
+    monkeypatch.setattr("sceneslam.engine.live._STEP_S", 0.3)
+    monkeypatch.setattr("sceneslam.engine.live._RAISE_S", 0.1)
+    monkeypatch.setattr(ExactModule, "track", stuck)
+    finished = run(config(run__report=False, run__mode="live"), tmp_path)
+    is_left.set()
+    assert finished.is_interrupted and "stopped after 1 observations" in finished.faults[0]
+    (sentence,) = finished.metrics["shortfalls"]
+    assert "slam.bright failed once at 0.0 s: did not return from a call" in sentence
+    assert len(Trajectory.read_tum(tmp_path / "trajectory.tum")) == 1
+    assert (tmp_path / "map" / "points.ply").exists()
+    assert not (tmp_path / "journal.bin").exists()
 
 
 def test_ctrl_c_after_the_last_observation_costs_no_result(tmp_path, pressing):

@@ -189,17 +189,41 @@ def test_ctrl_c_is_raised_after_the_step_that_runs():
 
 
 @pytest.mark.usefixtures("heeds_ctrl_c")
-def test_ctrl_c_while_the_last_step_is_waited_for_is_told_apart():
-    is_raised = threading.Event()
+@pytest.mark.parametrize("times", [1, 2])
+def test_step_that_does_not_return_is_waited_for_until_another_ctrl_c(monkeypatch, times):
+    monkeypatch.setattr("sceneslam.engine.live._STEP_S", 0.2 if times == 1 else 60.0)
+    monkeypatch.setattr("sceneslam.engine.live._RAISE_S", 0.2)
+    is_raised, has_ended = threading.Event(), threading.Event()
 
     def step(observation):
-        while not is_raised.wait(0.05):
-            interrupt()
-        return True
+        try:
+            for wait_s in [0.3, 0.0][-times:]:
+                interrupt()
+                is_raised.wait(wait_s)
+            is_raised.wait(60.0)  # as native code, which KeyboardInterrupt does not end
+        except KeyboardInterrupt:
+            has_ended.set()
+            raise
 
     with pytest.raises(StepInterrupt):
         run_live(observations(9, 10**6), step, print, settings=AT_ONCE)
+    assert not has_ended.is_set()
     is_raised.set()
+    assert has_ended.wait(60.0)
+
+
+@pytest.mark.usefixtures("heeds_ctrl_c")
+def test_step_that_does_not_return_is_ended_where_it_runs_python(monkeypatch):
+    monkeypatch.setattr("sceneslam.engine.live._STEP_S", 0.2)
+
+    def step(observation):
+        interrupt()
+        while True:
+            threading.Event().wait(0.01)
+
+    with pytest.raises(KeyboardInterrupt) as raised:
+        run_live(observations(9, 10**6), step, print, settings=AT_ONCE)
+    assert raised.type is KeyboardInterrupt
 
 
 def test_step_can_end_the_run_while_the_source_is_silent():

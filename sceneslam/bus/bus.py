@@ -160,6 +160,15 @@ class Bus:
         """Take a scene for the one around the robot; "": as the detector votes."""
         self._watch.selected = scene
 
+    def leave_awaited(self, stamp_ns: int) -> bool:
+        """Leave out the module that a step waits for, and log it; return whether there is one."""
+        awaited = [runner for runner in self.runners.values() if runner.is_awaited]
+        for runner in awaited:
+            runner.leave()
+            what = "did not return from a call when the run was stopped, and its map is lost"
+            self._log.add_fault(stamp_ns, f"slam.{runner.key} {what}")
+        return bool(awaited)
+
     def close(self, stamp_ns: int) -> None:
         """End the run: shut the module down, then the detector. May be called twice."""
         if not self._machine.is_terminated:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ctypes
 import threading
 from array import array
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from time import monotonic_ns
 
@@ -18,6 +20,10 @@ from sceneslam.types.run import Event, SlowPose
 _LOOK_S = 0.2  # interval of checks for Ctrl-C
 _BEHIND_S = 1.0  # if a recording is read too slowly, its playback is delayed in steps of this
 _LEAVE_S = 2.0  # wait for the source's thread to end; then it is abandoned
+# Waits for the last step to end; together with saving less than the 10 s after which systemd and
+# Docker kill what they have asked to stop.
+_STEP_S = 4.0  # by itself
+_RAISE_S = 1.0  # after KeyboardInterrupt was raised in it
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,7 +65,7 @@ class Spent:
 
 
 class StepInterrupt(KeyboardInterrupt):
-    """The end of a run that was not waited for: a step still runs beside what follows."""
+    """The end of a run whose last step did not return; if it does, it ends at once."""
 
 
 def run_live(
@@ -80,8 +86,9 @@ def run_live(
     Without a `feed` they are those of a recording, and paced by their stamps. `note` receives
     events of the input: `silent`, `returned`, `behind` (a recording is read too slowly and its
     playback delayed), and the feed's. Both functions run in the thread `bus`, the source in another
-    one. Their exceptions are raised here; Ctrl-C ends both, after the current step. Ctrl-C during
-    that step raises StepInterrupt.
+    one. Their exceptions are raised here; Ctrl-C ends both, after the current step. If that does
+    not end within some seconds, or at another Ctrl-C, KeyboardInterrupt is raised in it, too;
+    StepInterrupt is raised here if it goes on even then, as native code does.
     """
     run = _LiveRun(observations, step, note, settings=settings, feed=feed, spent=spent)
     run.tally = tally if tally is not None else run.tally
@@ -127,7 +134,7 @@ class _LiveRun:
             self._is_over.set()
             self._mailbox.close(is_emptied=True)
             if bus.ident is not None:
-                self._await_last_step()
+                self._await_last_step(bus.ident)
             if self._feed is not None:
                 self._feed.close()
             if source.ident is not None:
@@ -138,11 +145,17 @@ class _LiveRun:
             raise self._errors[0]
         return self.tally
 
-    def _await_last_step(self) -> None:
-        try:
-            self._has_stepped.wait()
-        except KeyboardInterrupt:
-            raise StepInterrupt from None
+    def _await_last_step(self, thread: int) -> None:
+        with suppress(KeyboardInterrupt):  # which waits no longer
+            self._has_stepped.wait(_STEP_S)
+        if self._has_stepped.is_set():
+            return
+        error = ctypes.py_object(KeyboardInterrupt)
+        ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread), error)
+        with suppress(KeyboardInterrupt):
+            self._has_stepped.wait(_RAISE_S)
+        if not self._has_stepped.is_set():
+            raise StepInterrupt
 
     def _step_all(self) -> None:
         try:

@@ -42,6 +42,8 @@ class Runner:
     def __init__(self, key: str, module: SlamModule, executor: Executor) -> None:
         self.key = key
         self.is_failed = False
+        self.is_awaited = False  # a call is under way that its caller waits for
+        self._is_left = False
         self.T_map_local: Transform | None = None  # None until it is placed
         self.track_ms = array("d")
         self.spent_ns = 0  # total time that callers waited
@@ -135,6 +137,10 @@ class Runner:
         finally:
             self.track_ms.append((perf_counter_ns() - began_ns) / 1e6)
 
+    def leave(self) -> None:
+        """Ask nothing more of the module, which does not return from a call."""
+        self._is_left = True
+
     def retire(self) -> Future[Legacy]:
         """Shut the module down; return its results, empty where it cannot give them."""
         with self._timed():
@@ -155,6 +161,8 @@ class Runner:
 
     def _retire(self) -> Legacy:
         layers, trajectory, lost = MapLayers(), Trajectory.empty(), list[str]()
+        if self._is_left:
+            return Legacy(layers=layers, trajectory=trajectory, lost="")
         self._drain()
         if self._is_active:
             with self._parting("could not give its revised trajectory, which is lost", lost):
@@ -221,9 +229,11 @@ class Runner:
 
     @contextmanager
     def _timed(self) -> Iterator[None]:
-        """Add up the time that the caller waits."""
+        """Add up the time that the caller waits, and tell that it does."""
         began_ns = perf_counter_ns()
+        self.is_awaited = True
         try:
             yield
         finally:
+            self.is_awaited = False
             self.spent_ns += perf_counter_ns() - began_ns
