@@ -7,7 +7,7 @@ import pytest
 
 from sceneslam.atlas.atlas import Atlas
 from sceneslam.atlas.pose_path import PosePath
-from sceneslam.atlas.save import save_grid, save_map, save_points, save_pose_graph
+from sceneslam.atlas.save import save_grid, save_map, save_nodes, save_points, save_pose_graph
 from sceneslam.atlas.submaps.correction import Correction
 from sceneslam.scans.occupancy_grid import drawn, walls
 from sceneslam.types import se3
@@ -129,6 +129,7 @@ def test_saved_pose_graph_is_what_gtsam_reads(tmp_path):
     np.testing.assert_allclose(values.atPose3(1).translation(), [1, 0, 0])
     information = gtsam.BetweenFactorPose3.noiseModel(graph.at(0)).information()
     np.testing.assert_allclose(np.diag(information), [4.5, 5.5, 6.5, 1.5, 2.5, 3.5])
+    save_nodes(measured, tmp_path / "pose_graph.tum")
     assert Trajectory.read_tum(tmp_path / "pose_graph.tum").stamps_ns.tolist() == [1, 2_000_000_003]
 
 

@@ -9,7 +9,7 @@ from planar_poses import transforms
 from test_atlas_places import CELL, plan_of, quality, text_of
 
 from sceneslam.atlas.lasting.map_files import save_map_files
-from sceneslam.atlas.lasting.merge import join_pieces
+from sceneslam.atlas.lasting.merge import join_pieces, side_by_side
 from sceneslam.atlas.lasting.prune import prune
 from sceneslam.atlas.lasting.saved_map import SavedMap, empty_map, forget_contradicted
 from sceneslam.atlas.places.floor_plan import join
@@ -452,6 +452,19 @@ def test_an_export_says_which_pieces_it_leaves_out(tmp_path, capsys):
     assert main(["export", str(tmp_path / "map"), "--out", str(tmp_path / "out")]) == 1
     assert capsys.readouterr().err == "error: pieces beside the first, which are not exported: 2\n"
     assert (tmp_path / "out" / "grid.yaml").exists()
+
+
+def test_an_export_has_a_file_of_rising_stamps_for_each_run(tmp_path):
+    nodes = [[0, 0, 0], [1, 0, 0], [2, 0, 0]]
+    both = side_by_side(map_of(WALL, WALL, nodes=nodes[:2]), map_of(WALL, nodes=nodes[2:]))
+    save_map_files(replace(both, pieces=np.zeros(3, np.int64)), tmp_path / "map")
+    out = tmp_path / "out"
+    assert main(["export", str(tmp_path / "map"), "--out", str(out)]) == 0
+    rows = [np.loadtxt(out / f"run_{run}.tum", ndmin=2)[:, :2].tolist() for run in (0, 1)]
+    assert rows == [[[0.0, 0.0], [1.0, 1.0]], [[0.0, 2.0]]]
+    save_map_files(map_of(WALL), tmp_path / "one")
+    assert main(["export", str(tmp_path / "one"), "--out", str(out)]) == 0
+    assert not (out / "run_1.tum").exists()
 
 
 def test_an_empty_map_leaves_out_no_piece(tmp_path, capsys):

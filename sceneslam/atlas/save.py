@@ -41,6 +41,7 @@ def save_map(hybrid: HybridMap, folder: Path) -> None:
         save_grid(hybrid.grid, folder / "grid.yaml")
     if hybrid.pose_graph is not None:
         save_pose_graph(hybrid.pose_graph, folder / "pose_graph.g2o")
+        save_nodes(hybrid.pose_graph, folder / "pose_graph.tum")
     save_landmarks(hybrid, folder / "landmarks.ply")
 
 
@@ -65,10 +66,10 @@ def save_landmarks(hybrid: HybridMap, path: Path) -> None:
 
 
 def save_pose_graph(graph: PoseGraphLayer, path: Path) -> None:
-    """Write the graph as g2o, and its vertices with their stamps as TUM beside it.
+    """Write the graph as g2o, information in the order translation, rotation vector.
 
-    Information is in the order translation, rotation vector, as gtsam and Ceres read it; g2o itself
-    reads that of the quaternion's vector part, half the angle.
+    So gtsam and Ceres read it; g2o itself reads that of the quaternion's vector part, half the
+    angle.
     """
     with replacing(path) as file:
         for row, numbers in enumerate(_quat_rows(graph.T_world_base)):
@@ -78,9 +79,11 @@ def save_pose_graph(graph: PoseGraphLayer, path: Path) -> None:
         for (start, end), numbers, weights in measured:
             words = " ".join(f"{weight:.9g}" for weight in weights)
             file.write(f"EDGE_SE3:QUAT {start} {end} {numbers} {words}\n")
-    Trajectory(stamps_ns=graph.stamps_ns, T_world_base=graph.T_world_base).write_tum(
-        path.with_suffix(".tum")
-    )
+
+
+def save_nodes(graph: PoseGraphLayer, path: Path) -> None:
+    """Write the poses of a graph with their stamps as TUM."""
+    Trajectory(stamps_ns=graph.stamps_ns, T_world_base=graph.T_world_base).write_tum(path)
 
 
 def save_grid(grid: GridLayer, path: Path) -> None:

@@ -101,7 +101,8 @@ def _export(options: argparse.Namespace) -> int:
         raise InputError(f"a map is saved in a folder of its own, choose another: {options.out}")
     saved = load_map_files(options.map)
     saved.check_size()
-    with closing(RunFolder.claim(options.out, kind="map's export", key="--out")):
+    with closing(RunFolder.claim(options.out, kind="map's export", key="--out")) as folder:
+        folder.clear()
         for path in export(saved, options.out):
             print(path)
     if saved.apart:
