@@ -12,13 +12,13 @@ from sceneslam.atlas.lasting.map_files import save_map_files
 from sceneslam.atlas.lasting.merge import join_pieces, side_by_side
 from sceneslam.atlas.lasting.prune import prune
 from sceneslam.atlas.lasting.saved_map import SavedMap, empty_map, forget_contradicted
-from sceneslam.atlas.places.floor_plan import join
+from sceneslam.atlas.places.floor_plan import empty, join
 from sceneslam.atlas.places.recognition import Recognizer
 from sceneslam.atlas.submaps.graph import connected, on_floor
 from sceneslam.atlas.submaps.submap import Drawing, Submap
 from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.maps.__main__ import main
-from sceneslam.maps.inspect import flaws
+from sceneslam.maps.inspect import described, flaws
 from sceneslam.types import planar, se3
 
 S = 10**9
@@ -445,6 +445,12 @@ def test_maps_of_runs_that_begin_alike_are_merged(tmp_path):
         save_map_files(replace(saved, submaps=(begun, later)), tmp_path / name)
     first, second, out = (str(tmp_path / name) for name in ("first", "second", "out"))
     assert main(["merge", first, second, "--out", out]) != 2
+
+
+def test_a_piece_is_as_large_as_what_is_known_of_it():
+    shown = plan_of(*["." * 40] * 20)
+    line = described(map_of(shown, empty(), pieces=[0, 1]))
+    assert "2.0 m x 1.0 m, free: 2.0 m2" in line[1] and "0.0 m x 0.0 m" in line[2]
 
 
 def test_an_export_says_which_pieces_it_leaves_out(tmp_path, capsys):

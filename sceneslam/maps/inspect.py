@@ -22,10 +22,11 @@ def described(saved: SavedMap) -> list[str]:
         own = saved.nodes(piece)
         plan = saved.plan(piece)
         modules = sorted({saved.submaps[node].module or "(bridged)" for node in own})
-        rows, columns = plan.free.shape
+        known = np.concatenate([plan.points, plan.free_points()])
+        x_m, y_m = np.ptp(known, axis=0) + CELL_M if len(known) else (0.0, 0.0)
         lines.append(
             f"piece {piece}: submaps: {len(own)}, by {', '.join(modules)}; "
-            f"{columns * CELL_M:.1f} m x {rows * CELL_M:.1f} m, "
+            f"{x_m:.1f} m x {y_m:.1f} m, "
             f"free: {plan.free.sum() * CELL_M**2:.1f} m2, wall cells: {len(plan)}, "
             f"views: {sum(len(saved.submaps[node].views) for node in own)}"
         )
