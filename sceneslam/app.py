@@ -6,7 +6,7 @@ import ctypes
 import gc
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing, suppress
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from sceneslam.config.build import RunParts, build
 from sceneslam.config.provenance import save_config
 from sceneslam.evaluation.metrics import Metrics
 from sceneslam.evaluation.report.summary import summary_lines
-from sceneslam.interrupts import StopRequests, stop_requests
+from sceneslam.interrupts import StopRequests, stop_raised, stop_requests
 from sceneslam.loop import RunLoop
 from sceneslam.results import Results, reset_peak_rss
 from sceneslam.storage.folder import RunFolder, give_back
@@ -69,10 +69,11 @@ def run(
     """
     _reclaim()
     reset_peak_rss()
-    with closing(build(config)) as parts:
-        folder = folder.resolve()  # a module may leave the working directory
-        with closing(RunFolder.claim(folder)) as claimed:
-            claimed.clear()
+    with ExitStack() as opened:
+        with stop_raised():
+            parts = opened.enter_context(closing(build(config)))
+            folder = folder.resolve()  # a module may leave the working directory
+            opened.enter_context(closing(RunFolder.claim(folder))).clear()
             cv2.setNumThreads(parts.run.threads)
             try:
                 results = _begin(config, parts, folder, title)
@@ -80,15 +81,15 @@ def run(
             except SceneSlamError:
                 give_back(folder)
                 raise
-            with stop_requests(lambda: _log.warning(_ANSWER, folder)) as requests:
-                with suppress(KeyboardInterrupt):  # after the last observation
-                    loop.run(lambda: requests.is_any)
-                    requests.end_run()
-                try:
-                    return _end(loop, results, reference, requests)
-                except KeyboardInterrupt:
-                    loop.close(is_saved=False)
-                    raise KeyboardInterrupt(_unsaved(folder)) from None
+        requests = opened.enter_context(stop_requests(lambda: _log.warning(_ANSWER, folder)))
+        with suppress(KeyboardInterrupt):  # after the last observation
+            loop.run(lambda: requests.is_any)
+            requests.end_run()
+        try:
+            return _end(loop, results, reference, requests)
+        except KeyboardInterrupt:
+            loop.close(is_saved=False)
+            raise KeyboardInterrupt(_unsaved(folder)) from None
 
 
 def _begin(config: Mapping[str, Any], parts: RunParts, folder: Path, title: str) -> Results:

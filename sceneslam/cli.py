@@ -43,6 +43,7 @@ from sceneslam.evaluation.report.summary import summary_lines
 from sceneslam.evaluation.shortfalls import REFERENCE
 from sceneslam.evaluation.verdict import verdict_lines
 from sceneslam.experiment import run_experiment
+from sceneslam.interrupts import stop_raised
 from sceneslam.storage.folder import give_back
 from sceneslam.streams import lost_output
 from sceneslam.types.errors import ConfigError, SceneSlamError, text_of
@@ -81,7 +82,8 @@ def main() -> None:
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises instead of exiting
     try:
         sys.argv[1:] = _words(sys.argv[1:]) or ["--help"]
-        job()
+        with stop_raised():
+            job()
     except Exception as error:
         if codes and not isinstance(error, HydraException):  # errors of a run are handled there
             raise
@@ -171,10 +173,11 @@ def carry_out(config: DictConfig) -> Ended:
     """Run one job, print its summary and return its result; raises KeyboardInterrupt if stopped."""
     folder = Path(HydraConfig.get().runtime.output_dir)
     try:
-        resolved(config)  # names a broken `${...}` before any key is read
-        words = typed_words(HydraConfig.get().overrides.task)
-        check_trust(config, words)
-        check_choices(words)
+        with stop_raised():
+            resolved(config)  # names a broken `${...}` before any key is read
+            words = typed_words(HydraConfig.get().overrides.task)
+            check_trust(config, words)
+            check_choices(words)
         if config.get("experiment"):
             verdict = run_experiment(config, folder)
             print("\n".join([*verdict_lines(verdict), f"report  {_short(folder)}/report.html"]))

@@ -55,6 +55,31 @@ def stop_requests(answer: Callable[[], None]) -> Iterator[StopRequests]:
 
 
 @contextmanager
+def stop_raised() -> Iterator[None]:
+    """Raise KeyboardInterrupt on all three signals, at the latest at the end.
+
+    A library that is called within, or is being imported, may lose it or make another error of it.
+    """
+    requested: list[int] = []
+
+    def handle(number: int, frame: object) -> None:
+        requested.append(number)
+        raise KeyboardInterrupt
+
+    try:
+        with _handler(handle):
+            yield
+    except KeyboardInterrupt:
+        raise
+    except BaseException:
+        if requested:
+            raise KeyboardInterrupt from None
+        raise
+    if requested:
+        raise KeyboardInterrupt
+
+
+@contextmanager
 def termination_noted(note: Callable[[], None]) -> Iterator[None]:
     """Call `note` on Ctrl-C, SIGTERM and SIGHUP, and do nothing else."""
 

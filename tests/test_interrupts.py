@@ -215,12 +215,23 @@ def test_command_answers_ctrl_c_while_it_saves(folder, times):
 
 
 SLOW_START = """
+import contextlib
 import signal
 import sys
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background ignores it
 from sceneslam import __main__ as program
 def press(*_, **__):
     signal.raise_signal(signal.SIGINT)
+def spoilt(*_, **__):
+    try:
+        press()
+    except KeyboardInterrupt:
+        raise ImportError("initialization failed") from None  # as pybind11
+def lost(*given, **named):
+    from sceneslam.config.build import build
+    with contextlib.suppress(KeyboardInterrupt):
+        press()
+    return build(*given, **named)
 sys.argv[1:] = ["+scenario=single", "run.report=false"]
 exec(sys.stdin.read())
 program.main()
@@ -232,7 +243,11 @@ program.main()
     [
         "program.register = press",
         "from hydra._internal.hydra import Hydra; Hydra.compose_config = press",
+        "from hydra._internal.hydra import Hydra; Hydra.compose_config = spoilt",
         "program.cli.check_trust = press",
+        "program.cli.check_trust = spoilt",
+        "import sceneslam.app; sceneslam.app.build = spoilt",
+        "import sceneslam.app; sceneslam.app.build = lost",
     ],
 )
 def test_ctrl_c_before_the_first_observation_is_one_sentence(tmp_path, pressed_in):

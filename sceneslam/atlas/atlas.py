@@ -79,6 +79,8 @@ class Atlas:
         `closing` are the modules that close loops themselves. With `is_looking`, places are
         recognized by what a camera sees.
         """
+        import gtsam  # noqa: F401 - Ctrl-C during its import, as in the run, would end its use
+
         closed = frozenset(closing)
         self._note = note
         loaded = self._lasting.loaded
