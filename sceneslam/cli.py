@@ -44,6 +44,7 @@ from sceneslam.evaluation.shortfalls import REFERENCE
 from sceneslam.evaluation.verdict import verdict_lines
 from sceneslam.experiment import run_experiment
 from sceneslam.interrupts import stop_raised
+from sceneslam.leaving import leave_threads
 from sceneslam.storage.folder import give_back
 from sceneslam.streams import lost_output
 from sceneslam.types.errors import ConfigError, SceneSlamError, text_of
@@ -96,7 +97,9 @@ def main() -> None:
             print(f"error: {_UNBEGUN}", file=sys.stderr)
         codes.append(INCOMPLETE if codes and str(stop) != _UNBEGUN else UNUSABLE)
     # The results of a run are in its folder, whatever standard output lost.
-    sys.exit(max(codes) if codes else _printed())
+    code = max(codes) if codes else _printed()
+    leave_threads(code)
+    sys.exit(code)
 
 
 def _printed() -> int:

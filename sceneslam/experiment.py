@@ -9,6 +9,7 @@ from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
+from multiprocessing.util import Finalize
 from pathlib import Path
 from typing import Any, cast
 
@@ -34,6 +35,7 @@ from sceneslam.evaluation.shortfalls import NO_POSE
 from sceneslam.evaluation.verdict import write_verdict
 from sceneslam.interfaces import Experiment
 from sceneslam.interrupts import terminate_with
+from sceneslam.leaving import leave_threads
 from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.experiment import Trial, TrialResult, Verdict
 from sceneslam.types.files import replacing
@@ -174,6 +176,7 @@ class _Trials:
 def _end_with(pipe: Connection) -> None:
     """Let a process that runs trials end when the experiment closes the pipe or was killed."""
     terminate_with(os.dup(pipe.fileno()))
+    Finalize(None, leave_threads, args=(0,), exitpriority=0)  # before it waits for its threads
 
 
 def _run_beside(config: dict[str, Any], folder: Path, name: str) -> None:

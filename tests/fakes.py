@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -119,6 +120,14 @@ class ExactModule:
 
     def shutdown(self):
         self.shutdowns += 1
+
+
+class LingeringModule(ExactModule):
+    """Leaves a thread running that waits for ever."""
+
+    def __init__(self):
+        super().__init__()
+        threading.Thread(target=threading.Event().wait, name="lingering").start()
 
 
 class ClosingModule(ExactModule):

@@ -5,7 +5,9 @@ import signal
 import subprocess
 import sys
 import threading
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import suppress
+from multiprocessing import get_context
 from pathlib import Path
 
 import pytest
@@ -16,7 +18,7 @@ from tqdm import tqdm
 from sceneslam.app import run
 from sceneslam.atlas.atlas import Atlas
 from sceneslam.bus.bus import Bus
-from sceneslam.experiment import _run_unless_finished
+from sceneslam.experiment import _end_with, _run_unless_finished
 from sceneslam.interrupts import StopRequests
 from sceneslam.keeping import Keeping
 from sceneslam.recover.recover import recover
@@ -262,6 +264,21 @@ def test_ctrl_c_before_the_first_observation_is_one_sentence(tmp_path, pressed_i
     )
     assert done.returncode == 2
     assert done.stderr == "error: stopped before the first observation\n"
+
+
+def test_thread_that_a_module_leaves_running_is_named_and_does_not_delay_the_exit(folder):
+    done = pressed(folder, 0, "~slam.only", "+slam.only={_target_:fakes.LingeringModule}")
+    assert done.returncode == 0
+    assert "ended with the process: thread lingering\n" in done.stderr
+
+
+def test_thread_that_a_trial_leaves_running_does_not_keep_the_experiment(capfd):
+    context = get_context("spawn")
+    reader, writer = context.Pipe(duplex=False)
+    pool = ProcessPoolExecutor(1, context, initializer=_end_with, initargs=(reader,))
+    with reader, writer, pool:
+        pool.submit(exec, "from fakes import LingeringModule; LingeringModule()").result()
+    assert "ended with the process: thread lingering\n" in capfd.readouterr().err
 
 
 def test_ctrl_c_while_the_reference_is_saved_is_before_the_run_itself(folder):

@@ -21,6 +21,7 @@ from omegaconf import DictConfig
 from sceneslam.cli import CONFIG, INCOMPLETE, OK, Ended, carry_out
 from sceneslam.collect.status import State, Status
 from sceneslam.interrupts import terminate_with
+from sceneslam.leaving import leave_threads
 from sceneslam.sweep.plugin import COMPOSED
 
 _STATES = {OK: State.DONE, INCOMPLETE: State.INCOMPLETE}
@@ -34,6 +35,7 @@ def main() -> None:
     status.now(State.RUNNING, host=platform.node(), pid=os.getpid()).write(folder)
     state, error = _run(folder)
     status.now(state, error, host=platform.node(), pid=os.getpid()).write(folder)
+    leave_threads(0)
 
 
 def _run(folder: Path) -> tuple[State, str]:
