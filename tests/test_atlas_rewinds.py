@@ -212,6 +212,10 @@ class Driving:
         for ns in [ns for ns in self.path.known if ns >= second * S]:
             self.path.put(ns, ns / S, session=1)
 
+    def told(self, what="loop"):
+        """Return the seconds of the loops that were found, or of those `loop_withdrawn`."""
+        return [ns // S for event, ns, _ in self.events if event == what]
+
     def finish(self):
         return self.own.finish(lambda ns: self.path.known[ns].T_map_base, [])
 
@@ -252,13 +256,14 @@ def test_the_newest_pose_is_corrected_by_loops_and_each_is_reported_once(monkeyp
     assert drive.own.take_correction() is None
     drive.to(*range(4, 7))
     assert solving.lengths == [1, 2] and solving.threads == [threading.main_thread()] * 2
-    assert [(event, ns // S) for event, ns, _ in drive.events] == [("loop", 0), ("loop", 3)]
-    assert drive.events[1][2]["to_ns"] == 0 and not drive.events[1][2]["in_loaded_map"]
+    assert drive.told() == [0, 3]
+    assert drive.events[-1][2]["to_ns"] == 0 and not drive.events[-1][2]["in_loaded_map"]
     solving.found = False
     drive.to(*range(7, 10))
     after = drive.own.take_correction()  # its loops are not believed any more
     np.testing.assert_array_equal(after.T_new_old, [at()] * 3)
     assert (after.stamps_ns // S).tolist() == [0, 3, 6]
+    assert drive.told() == drive.told("loop_withdrawn") == [0, 3]
 
 
 def test_a_rewind_that_takes_the_last_loops_takes_their_correction(monkeypatch):
@@ -290,12 +295,12 @@ def test_a_loop_that_is_found_again_after_a_rewind_is_reported_only_if_it_is_ano
     drive.to(*range(7))
     drive.rewind(3)
     drive.to(7, 8, session=1)  # the second submap begins at 3 s again
-    assert [ns // S for _, ns, _ in drive.events] == [0, 3]
+    assert drive.told() == [0, 3]
     drive.own.rewind(4 * S)
     for second in range(4, 9):
         drive.path.put(second * S, second, session=2)
     drive.to(9, session=2)
-    assert [ns // S for _, ns, _ in drive.events] == [0, 3, 4]
+    assert drive.told() == [0, 3, 4]
 
 
 def test_what_was_solved_of_poses_that_were_replaced_meanwhile_is_not_used(monkeypatch):
@@ -304,17 +309,17 @@ def test_what_was_solved_of_poses_that_were_replaced_meanwhile_is_not_used(monke
     drive.to(*range(4))
     solving.wait(drive)
     drive.to(4)
-    assert [ns // S for _, ns, _ in drive.events] == [0]
+    assert drive.told() == [0]
     drive.to(5, 6, 7)
     drive.rewind(5)
     drive.to(8, session=1)  # it is not waited for
     assert len(drive.own._collector.chain) == 3
     solving.wait(drive)
     drive.to(9, session=1)
-    assert [ns // S for _, ns, _ in drive.events] == [0]
+    assert drive.told() == [0]
     solving.wait(drive)
     drive.to(10, session=1)
-    assert [ns // S for _, ns, _ in drive.events] == [0, 5]
+    assert drive.told() == [0, 5]
     assert solving.lengths == [1, 2, 3] and solving.kept == [0, 1, 1]
     assert threading.main_thread() not in solving.threads
     solving.may_go_on.set()

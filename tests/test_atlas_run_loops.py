@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from planar_poses import transforms
-from test_atlas_graph import Given, finished
+from test_atlas_graph import Given, finished, solved
 from test_atlas_limits import loop
 from test_atlas_maps import WALL, map_of
 from test_atlas_submaps import S, at
@@ -170,6 +170,12 @@ def test_nodes_return_to_where_motions_lead_when_no_loop_is_left(monkeypatch):
     straight = graph.extend(own.chain, is_level=True)
     assert straight.loops == ()
     np.testing.assert_array_equal(straight.T_map_node, own.chain.T_run_node)
+
+
+@pytest.mark.parametrize(("aside_m", "count"), [(0.02, 2), (3.0, 0)])
+def test_a_loop_that_the_final_nodes_contradict_is_left_out(monkeypatch, aside_m, count):
+    Given(monkeypatch, found=[off(0, 5, aside_m), off(0, 6, aside_m)])
+    assert len(solved(finished(48)).loops) == count
 
 
 def test_a_solution_is_cut_with_its_loops():

@@ -85,7 +85,7 @@ class Mapper:
         self._solved = SolvedRun(T_map_node=np.zeros((0, 4, 4)), loops=())
         self._is_news = False  # nodes were moved since the correction was taken
         self._is_over = False
-        self._told: set[tuple[int, int, int]] = set()  # loops, by their run and stamps
+        self._told: dict[tuple[int, int, int], dict[str, Any]] = {}  # loops, by run and stamps
 
     @property
     def is_placed(self) -> bool:
@@ -392,15 +392,21 @@ class Mapper:
         return None if known is None else known.T_map_base
 
     def _tell_loops(self) -> None:
-        """Report the loops that are new."""
+        """Report the loops that are new, and those that the last solution has withdrawn."""
         submaps = [*self._loaded.submaps, *self._collector.chain.submaps]
+        before, self._told = self._told, {}
         for loop in self._solved.loops:
             first, second = submaps[loop.first], submaps[loop.second]
             ends = first.run, int(first.stamps_ns[0]), int(second.stamps_ns[0])
-            if ends in self._told:
-                continue
-            self._told.add(ends)
-            fields: dict[str, Any] = {"module": second.module, "to_module": first.module}
-            fields |= {"to_ns": ends[1]}
-            fields |= {"in_loaded_map": loop.first < len(self._loaded.submaps)}
-            self._note("loop", ends[2], **fields)
+            self._told[ends] = {
+                "module": second.module,
+                "to_module": first.module,
+                "to_ns": ends[1],
+                "in_loaded_map": loop.first < len(self._loaded.submaps),
+            }
+        for ends, fields in before.items():
+            if ends not in self._told:
+                self._note("loop_withdrawn", ends[2], **fields)
+        for ends, fields in self._told.items():
+            if ends not in before:
+                self._note("loop", ends[2], **fields)

@@ -145,11 +145,10 @@ class RunGraph:
             places=[*moving.loops, *places],
             uprights=uprights(submaps, nodes, [*around, *range(count, len(nodes))]),
         )
-        accepted = [place for place in places if fits(place, solved.T_map_node)]
-        accepted += [loops[index] for index in solved.accepted]
+        closed = [*places, *(loops[index] for index in solved.accepted)]
         return SolvedRun(
             T_map_node=solved.T_map_node[count:],
-            loops=tuple(accepted),
+            loops=tuple(loop for loop in closed if fits(loop, solved.T_map_node)),
             own_loops=tuple(own_loops),
             T_map_loaded=solved.T_map_node[:count] if around else None,
         )
