@@ -14,6 +14,7 @@ import sys
 from contextlib import nullcontext
 from pathlib import Path
 from time import monotonic, sleep
+from types import SimpleNamespace
 
 import pytest
 from configured import config
@@ -26,6 +27,7 @@ from sceneslam.app import run
 from sceneslam.collect.rows import read_rows
 from sceneslam.collect.status import State, Status
 from sceneslam.config.check import check_keys, check_maps_apart
+from sceneslam.interrupts import termination_noted
 from sceneslam.storage.folder import RunFolder
 from sceneslam.sweep.__main__ import main
 from sceneslam.sweep.backends import Basic, Joblib, Ray, Submitit
@@ -441,6 +443,28 @@ def test_cluster_that_cannot_be_used_is_named(backend, sentence, tmp_path, monke
     order = JobOrder(folder=tmp_path, code=tmp_path, began_in=tmp_path, stop=tmp_path / "stop")
     with pytest.raises(ConfigError, match=re.escape(sentence)):
         backend.run([order])
+
+
+def test_sigterm_stops_a_sweep_with_ray_in_order(tmp_path, monkeypatch):
+    before, stop = signal.getsignal(signal.SIGTERM), tmp_path / "stop"
+
+    def stopped(running):
+        signal.raise_signal(signal.SIGTERM)
+        assert stop.exists()
+        return running, []
+
+    ray = SimpleNamespace(
+        init=lambda *given, **named: signal.signal(signal.SIGTERM, signal.SIG_IGN),
+        remote=lambda **named: lambda job: SimpleNamespace(remote=lambda order: order),
+        wait=stopped,
+        get=lambda order: None,
+        shutdown=lambda: signal.signal(signal.SIGTERM, before),
+    )
+    monkeypatch.setitem(sys.modules, "ray", ray)
+    order = JobOrder(folder=tmp_path, code=tmp_path, began_in=tmp_path, stop=stop)
+    with termination_noted(lambda: None):
+        Ray(None, None, 1).run([order])
+    assert signal.getsignal(signal.SIGTERM) == before
 
 
 def test_status_is_read_as_it_was_written(tmp_path):

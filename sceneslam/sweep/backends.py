@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from time import sleep
@@ -12,6 +13,7 @@ from typing import Any, Protocol
 
 from sceneslam.collect.status import State, Status
 from sceneslam.config.check import first_line
+from sceneslam.interrupts import termination_noted
 from sceneslam.sweep.supervise import JobOrder, run_job, settle
 from sceneslam.types.errors import ConfigError
 
@@ -138,7 +140,8 @@ class Ray:
         except (ConnectionError, RuntimeError, ValueError) as error:
             reason = f"a Ray cluster that answers; null: one of its own ({first_line(error)})"
             raise ConfigError("hydra.launcher.address", self._address, reason) from error
-        try:
+        with termination_noted(orders[0].stop.touch), ExitStack() as opened:  # Ray's own ends us
+            opened.callback(ray.shutdown)
             task = ray.remote(num_cpus=self._cpus_per_job, max_retries=0)(run_job)
             prepared = _with_cores(orders, int(self._cpus_per_job))
             running = {task.remote(order): order for order in prepared}
@@ -146,8 +149,6 @@ class Ray:
                 ended, _ = ray.wait(list(running))
                 for reference in ended:
                     _note(running.pop(reference), partial(ray.get, reference))
-        finally:
-            ray.shutdown()
 
 
 def _check_count(name: str, value: object) -> None:
