@@ -33,7 +33,8 @@ def sighting(bend, *, size=1.0, is_monocular=False, odometry=None):
     )
     features = features_at(uv_px, random_descriptors(rng, COUNT))
     image_bgr = np.zeros((480, 640, 3), np.uint8)
-    estimate = SimpleNamespace(linearised=linearised, covariance=1e-6 * np.eye(6))
+    covariance, prior = 1e-6 * np.eye(6), np.zeros((6, 6))
+    estimate = SimpleNamespace(linearised=linearised, covariance=covariance, prior=prior)
     rows = np.arange(COUNT)
     fix = SimpleNamespace(estimate=estimate, feature_rows=rows, landmark_ids=rows)
     view = SimpleNamespace(
@@ -86,6 +87,17 @@ def test_noise_is_as_large_as_residuals_show(size, noise):
     covariance = certainty.covariance(view, fix, se3.identity(), [se3.identity()])
     assert covariance[0, 0] == pytest.approx(1e-6 * noise, rel=0.3)
     assert noise_ratio(fix) == pytest.approx(size**2 / 0.84, rel=0.1)
+
+
+def test_fine_residuals_do_not_make_odometry_more_certain():
+    view, fix = sighting(bend=0.0, size=0.2)
+    by_image = 1e-6 * np.array([100.0, 1.0, 1.0, 1.0, 1.0, 1.0])
+    fix.estimate.prior = np.diag([1e4, 0.0, 0.0, 0.0, 0.0, 0.0])
+    fix.estimate.covariance = np.linalg.inv(np.diag(1 / by_image) + fix.estimate.prior)
+    certainty = Certainty(landmarks_with(0.0))
+    covariance = certainty.covariance(view, fix, se3.identity(), [se3.identity()])
+    assert covariance[1, 1] < 0.1e-6
+    assert covariance[0, 0] == pytest.approx(1 / (1e4 + 1 / (100.0 * covariance[1, 1])))
 
 
 def test_what_fine_residuals_have_in_common_is_no_wrong_model():

@@ -106,6 +106,7 @@ def found_at(T_local_base):
     estimate = PoseEstimate(
         T_local_base=T_local_base,
         covariance=0.02**2 * np.eye(6),
+        prior=np.zeros((6, 6)),
         inliers=nothing > 0,
         depth_inliers=nothing > 0,
         depth_agreement_ratio=1.0,
@@ -155,6 +156,8 @@ def test_a_pose_is_fused_with_odometry_and_wheels_that_contradict_it_may_slip(fo
         return
     assert fix.estimate.T_local_base[0, 3] == pytest.approx(expected_m, abs=0.001)
     assert fix.estimate.covariance[3, 3] == pytest.approx(0.04**2 / 2)  # turns do not slip
+    by_image = np.linalg.inv(fix.estimate.covariance) - fix.estimate.prior
+    assert np.linalg.inv(by_image) == pytest.approx(0.04**2 * np.eye(6))  # images err alike
 
 
 @pytest.mark.parametrize(

@@ -90,7 +90,8 @@ def _fused(found: VisualFix, prediction: Prediction) -> VisualFix | None:
         return None
     gain = predicted @ np.linalg.inv(total)
     T_local_base = se3.orthonormal(prediction.T_local_base @ se3.exp(gain @ off))
-    return _with(found, T_local_base, (np.eye(6) - gain) @ predicted)
+    covariance = (np.eye(6) - gain) @ predicted
+    return _with(found, T_local_base, covariance, np.asarray(np.linalg.inv(predicted)))
 
 
 def _held(
@@ -110,12 +111,20 @@ def _held(
     off = prior.off(found.estimate.T_local_base)
     if off @ information @ off > _CHI2:
         return None
-    return _with(found, found.estimate.T_local_base, _CORRELATED * found.estimate.covariance)
+    covariance = _CORRELATED * found.estimate.covariance
+    return _with(found, found.estimate.T_local_base, covariance, information)
 
 
-def _with(found: VisualFix, T_local_base: Transform, covariance: NDArray[np.float64]) -> VisualFix:
+def _with(
+    found: VisualFix,
+    T_local_base: Transform,
+    covariance: NDArray[np.float64],
+    prior: NDArray[np.float64],
+) -> VisualFix:
     covariance = 0.5 * (covariance + covariance.T)
-    estimate = replace(found.estimate, T_local_base=T_local_base, covariance=covariance)
+    estimate = replace(
+        found.estimate, T_local_base=T_local_base, covariance=covariance, prior=prior
+    )
     return replace(found, estimate=estimate)
 
 

@@ -45,15 +45,18 @@ class Certainty:
     ) -> NDArray[np.float64]:
         """Return the covariance (6, 6) of a pose, of se3.log order [m, rad], in base.
 
-        It is relative to the local map. Noise is as large as the pixels' residuals show, of
-        depths, too. If neighbouring pixels have common residuals, which are not noise, information
-        is reduced accordingly, and a share of the motion from the surrounding keyframes is added,
-        by the variance that is in common. The scale error of triangulated landmarks grows from the
-        place where depth was seen last.
+        It is relative to the local map. The image's noise is as large as the pixels' residuals
+        show, of depths, too; odometry's covariance remains as it is. If neighbouring pixels have
+        common residuals, which are not noise, the image's information is reduced accordingly, and a
+        share of the motion from the surrounding keyframes is added, by the variance that is in
+        common. The scale error of triangulated landmarks grows from the place where depth was seen
+        last.
         """
         common = max(1.0, self._common.follow(common_ratio(view, fix)))
         noise = float(np.clip(noise_ratio(fix), _FINEST, 1.0))
-        measured = fix.estimate.covariance * common * noise
+        prior = fix.estimate.prior
+        by_image = np.linalg.inv(fix.estimate.covariance) - prior
+        measured = np.linalg.inv(by_image / (common * noise) + prior)
         away_m = self._landmarks.points_local[fix.landmark_ids] - T_local_base[:3, 3]
         away2_m2 = float(np.median((away_m**2).sum(axis=1)))
         model = model_covariance(np.stack(T_keyframe_base), away2_m2)

@@ -76,6 +76,7 @@ class PoseEstimate:
 
     T_local_base: Transform
     covariance: NDArray[np.float64]  # (6, 6), se3.log order, base frame
+    prior: NDArray[np.float64]  # (6, 6), other sensors' share of its inverse; zero without any
     inliers: NDArray[np.bool_]  # (N,), pixels agree
     depth_inliers: NDArray[np.bool_]  # (N,), depths agree too
     depth_agreement_ratio: float  # of the inliers that have a depth; 1 without any
@@ -88,7 +89,7 @@ class _Descent:
 
     T_local_cam: Transform
     errors: PoseErrors
-    normal: NDArray[np.float64]  # (6, 6), of the last step's twist of the camera
+    normal: NDArray[np.float64]  # (6, 6), of the last step's twist of the camera, without a prior
     inliers: NDArray[np.bool_]  # (N,), pixels agree
     depth_inliers: NDArray[np.bool_]  # (N,), depths agree too
 
@@ -157,12 +158,13 @@ class PoseSolver:
             sigma_px=measured.seen.sigma_px[inliers],
             normal=by_pixel @ by_pixel.T + by_depth @ by_depth.T,
         )
-        # If the errors are larger than their sigmas, the covariance is scaled up.
-        covariance = se3.carried(np.linalg.inv(end.normal), self._camera.T_base_cam)
-        covariance *= max(1.0, linearised.pixel_variance)
+        # If the errors are larger than their sigmas, the image tells that much less.
+        information = end.normal / max(1.0, linearised.pixel_variance) + self._known(prior)
+        covariance = se3.carried(np.linalg.inv(information), self._camera.T_base_cam)
         return PoseEstimate(
             T_local_base=se3.orthonormal(end.T_local_cam @ self._T_cam_base),
             covariance=0.5 * (covariance + covariance.T),
+            prior=np.zeros((6, 6)) if prior is None else prior.information,
             inliers=inliers,
             depth_inliers=end.depth_inliers,
             depth_agreement_ratio=_share(end.depth_inliers, inliers & measured.seen.measures_depth),
@@ -185,11 +187,11 @@ class PoseSolver:
         for _ in range(steps):
             rows = found.rows(found.scale(inliers, depth_inliers)).reshape(7, -1)
             products = rows @ rows.T
-            normal, slopes = products[:6, :6] + self._known(prior), products[:6, 6]
+            normal, slopes = products[:6, :6], products[:6, 6]
             if prior is not None:
                 off = prior.off(se3.inverse(T_cam_local) @ self._T_cam_base)
                 slopes = slopes + self._to_base.T @ prior.information @ off
-            step = _solve(normal, slopes)
+            step = _solve(normal + self._known(prior), slopes)
             if step is None:
                 return None
             T_cam_local = se3.exp(step) @ T_cam_local
