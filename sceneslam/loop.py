@@ -145,7 +145,7 @@ class RunLoop:
             self.truth = self._parts.source.ground_truth()
         except InputError as error:
             self.faults.append(f"no ground truth: {error}")
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             _log.info("no ground truth", exc_info=error)
             self.faults.append(f"no ground truth: {text_of(error)}")
 
@@ -201,7 +201,7 @@ class RunLoop:
         source = self._parts.source
         try:
             found = source.survey() if isinstance(source, Surveyed) else None
-        except Exception as error:  # errors of the input are reported when it is read
+        except (Exception, SystemExit) as error:  # errors of the input are reported when it is read
             _log.info("the source could not be surveyed", exc_info=error)
             return
         if found is None:

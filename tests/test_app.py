@@ -4,13 +4,14 @@ import json
 import os
 import resource
 import signal
+import sys
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 from configured import config
-from fakes import LateStamps
+from fakes import FakeSource, LateStamps
 
 from sceneslam.app import run
 from sceneslam.atlas.atlas import Atlas
@@ -146,6 +147,16 @@ def test_ground_truth_that_cannot_be_read_costs_no_result(tmp_path):
 def test_source_that_breaks_at_its_ground_truth_costs_no_result(tmp_path):
     finished = run(config(source___target_="fakes.BuggyTruth"), tmp_path)
     assert finished.faults == ("no ground truth: ValueError: 7 numbers",)
+
+
+def test_source_that_calls_sys_exit_outside_its_observations_costs_the_truth_alone(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setattr(FakeSource, "ground_truth", lambda self: sys.exit(3))
+    monkeypatch.setattr(FakeSource, "survey", lambda self: sys.exit(3), raising=False)
+    finished = run(config(run__report=False), tmp_path)
+    assert finished.faults == ("no ground truth: SystemExit: 3",)
+    assert len(finished.trajectory) == 100 and (tmp_path / "metrics.json").exists()
     assert (tmp_path / "metrics.json").exists() and len(finished.trajectory) == 100
 
 
