@@ -213,6 +213,16 @@ def test_job_without_any_pose_is_final(tmp_path):
     assert len(errors) == 1 and status.is_final(tmp_path)
 
 
+def test_job_whose_reference_has_no_pose_is_final(tmp_path):
+    error = "no pose: no scene was confirmed"
+    (tmp_path / "reference").mkdir()
+    metrics = {"faults": [], "errors": [error], "shortfalls": []}
+    (tmp_path / "reference" / "metrics.json").write_text(json.dumps(metrics))
+    assert Status(state=State.INCOMPLETE, error=f"reference: {error}").is_final(tmp_path)
+    full = f"reference: {error}; reference: no space left"
+    assert not Status(state=State.INCOMPLETE, error=full).is_final(tmp_path)
+
+
 def test_job_that_a_stop_keeps_from_beginning_has_its_earlier_status(tmp_path, monkeypatch):
     def stop(_, orders):
         orders[0].stop.touch()

@@ -58,10 +58,11 @@ class Status:
         if self.state is not State.INCOMPLETE:
             return self.state is State.DONE
         try:
-            said = _missing_poses(folder)
+            said = list[str]()
             if self.error.startswith(REFERENCE):
-                of_reference = _missing_poses(folder / "reference")
-                said = [*(f"{REFERENCE}{one}" for one in of_reference), *said]
+                said += [f"{REFERENCE}{one}" for one in _missing_poses(folder / "reference")]
+            if not self.error.startswith(f"{REFERENCE}{NO_POSE}"):  # else the run did not begin
+                said += _missing_poses(folder)
         except (OSError, KeyError, TypeError, ValueError):
             return False
         return self.error == "; ".join(said)
