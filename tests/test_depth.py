@@ -349,6 +349,22 @@ def test_start_of_a_real_recording_is_followed_by_depth_alone(
     assert errors.rmse_m < bound_m
 
 
+def beside_by_5_cm(samples, prior, known, grid, *, weak_ratio):
+    """A registration along the image's rows, a direction that it hardly measures."""
+    T_local_cam = prior.T_local_cam @ se3.from_xy_yaw(0.05, 0.0, 0.0)
+    return SurfaceRegistration(
+        T_local_cam,
+        np.diag([1 / 0.05**2, 1e6, 1e6, 1e6, 1e6, 1e6]),  # axes of the camera
+        common_ratio=1.0,
+        misfit=1.0,
+        T_keyframe_cam=T_local_cam[None],
+        localizability=samples.localizability(),
+        matched_ratio=1.0,
+        seen=len(samples),
+        matched=len(samples),
+    )
+
+
 @pytest.mark.parametrize("is_guessed", [False, True])
 def test_a_registration_that_hardly_measures_a_direction_leaves_it_to_tracking(
     monkeypatch, is_guessed
@@ -358,29 +374,32 @@ def test_a_registration_that_hardly_measures_a_direction_leaves_it_to_tracking(
     surface = reader.read(depth_image(WALL, se3.identity()))
     keyframes = KeyframeMap(reader.grid)
     graph = DepthPoseGraph(keyframes, weak_ratio=0.005)
-    information = np.diag([1 / 0.05**2, 1e6, 1e6, 1e6, 1e6, 1e6])  # axes of the camera
-
-    def beside(samples, prior, known, grid, *, weak_ratio):
-        T_local_cam = prior.T_local_cam @ se3.from_xy_yaw(0.05, 0.0, 0.0)
-        held = samples.localizability()
-        return SurfaceRegistration(
-            T_local_cam,
-            information,
-            common_ratio=1.0,
-            misfit=1.0,
-            T_keyframe_cam=T_local_cam[None],
-            localizability=held,
-            matched_ratio=1.0,
-            seen=len(samples),
-            matched=len(samples),
-        )
-
-    monkeypatch.setattr("sceneslam.modules.slam.depth.pose_graph.register", beside)
+    monkeypatch.setattr("sceneslam.modules.slam.depth.pose_graph.register", beside_by_5_cm)
     tracked = [CAMERA.T_base_cam, se3.from_xy_yaw(0.0, 0.2, 0.0) @ CAMERA.T_base_cam]
     for T_local_cam in tracked:
         known = np.diag([0.2**2 if is_guessed else 1e-6, *[1e-6] * 5])
-        graph.connect(keyframes.add(surface, T_local_cam), known)
+        graph.connect(keyframes.add(surface, T_local_cam), known, tracked_by=0)
     graph.finish()
     moved = se3.inverse(tracked[1]) @ keyframes[1].T_local_cam
     low, high = (0.04, 0.05) if is_guessed else (0.0, 0.005)
     assert low < moved[0, 3] < high
+
+
+def test_a_keyframe_stays_beside_the_one_that_it_was_tracked_by(monkeypatch):
+    """The second of three was guessed, and is found 0.05 m away; the first tracked the third."""
+    reader = DepthSurfaceReader(CAMERA)
+    surface = reader.read(depth_image(WALL, se3.identity()))
+    keyframes = KeyframeMap(reader.grid)
+    graph = DepthPoseGraph(keyframes, weak_ratio=0.005)
+    register = "sceneslam.modules.slam.depth.pose_graph.register"
+    known, guessed = (np.diag([variance, *[1e-6] * 5]) for variance in (1e-6, 0.2**2))
+    monkeypatch.setattr(register, beside_by_5_cm)
+    for covariance in (known, guessed):
+        graph.connect(keyframes.add(surface, CAMERA.T_base_cam), covariance, tracked_by=0)
+    graph.advance()
+    monkeypatch.setattr(register, lambda *_, **__: None)
+    graph.connect(keyframes.add(surface, CAMERA.T_base_cam), known, tracked_by=0)
+    graph.finish()
+    moved = [se3.inverse(CAMERA.T_base_cam) @ keyframes[k].T_local_cam for k in (1, 2)]
+    assert moved[0][0, 3] > 0.04
+    assert abs(moved[1][0, 3]) < 0.005

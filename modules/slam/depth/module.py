@@ -182,10 +182,10 @@ class DepthSlam(LocalModule, Checked):
     def _add_keyframe(
         self, surface: Surface, T_local_cam: se3.Transform, covariance: Doubles
     ) -> None:
-        """Add a keyframe at a pose with its covariance (6, 6), in base."""
-        self._reference = self._map.add(surface, T_local_cam)
+        """Add a keyframe at a pose, tracked by the last one, with its covariance (6, 6), in base."""
+        tracked_by, self._reference = self._reference, self._map.add(surface, T_local_cam)
         in_cam = se3.carried(covariance, se3.inverse(self._camera.T_base_cam))
-        self._graph.connect(self._reference, in_cam)
+        self._graph.connect(self._reference, in_cam, tracked_by=tracked_by)
 
     def _answer(self, tracking: Tracking) -> Tracking:
         """Return the answer with the map's revision and certainty; its pose joins the frames."""

@@ -33,13 +33,14 @@ class DepthPoseGraph:
         self._waiting: list[tuple[int, int]] = []
         self.is_fresh = False  # there are new edges since the last optimisation
 
-    def connect(self, index: int, covariance: Doubles) -> None:
+    def connect(self, index: int, covariance: Doubles, *, tracked_by: int) -> None:
         """Queue registrations of a new keyframe with all overlapping ones.
 
-        `covariance` (6, 6) is that of its pose as tracked, cam: large where it was guessed.
+        `covariance` (6, 6) is that of its pose as tracked by another keyframe, `tracked_by`, cam:
+        large where it was guessed. The first keyframe has no other.
         """
         if index:
-            self._edges.append(self._chain(index, covariance))
+            self._edges.append(self._tracked(tracked_by, index, covariance))
         samples = samples_of(self._map[index].surface(), self._map.grid)
         overlaps = self._map.overlaps(samples, self._map[index].T_local_cam)
         partners = [o.index for o in overlaps if o.ratio > _OVERLAP_MIN_RATIO and o.index != index]
@@ -70,13 +71,12 @@ class DepthPoseGraph:
             keyframe.move(solved[index])
         self.is_fresh = False
 
-    def _chain(self, index: int, covariance: Doubles) -> Edge:
+    def _tracked(self, first: int, second: int, covariance: Doubles) -> Edge:
         """Return the edge by tracking, which knows what odometry measured, too."""
-        before, this = self._map[index - 1], self._map[index]
         return Edge(
-            first=index - 1,
-            second=index,
-            T_first_second=before.T_cam_local @ this.T_local_cam,
+            first=first,
+            second=second,
+            T_first_second=self._map[first].T_cam_local @ self._map[second].T_local_cam,
             covariance=_TRACKED + covariance,
         )
 
