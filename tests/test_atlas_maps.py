@@ -149,6 +149,29 @@ def test_above_a_long_ramp_a_robot_stands_level_whichever_way_it_looks():
     np.testing.assert_allclose(saved.standing(back), back, atol=1e-9)
 
 
+@pytest.mark.parametrize(("is_known", "within_rad"), [(True, 1e-6), (False, 0.08)])
+def test_a_robot_stands_level_in_a_map_that_was_made_by_hand(is_known, within_rad):
+    """Submaps, and the map with its first, begin tilted by up to 12 degrees, and at any height."""
+    rng, count = np.random.default_rng(0), 40
+    ring = [se3.from_xy_yaw(12 * np.sin(k / 5), 12 * np.cos(k / 5), -k / 5) for k in range(count)]
+    off = rng.uniform(-1.0, 1.0, (count, 6)) * [0.0, 0.0, 0.1, 0.15, 0.15, 0.0]
+    held = np.array([T @ se3.exp(each) for T, each in zip(ring, off, strict=True)])
+    T_map_level = se3.inverse(held[0])
+    nodes = T_map_level @ held
+    motions = [
+        replace(edge(k, k + 1), T_first_second=se3.inverse(nodes[k]) @ nodes[k + 1])
+        for k in range(count - 1)
+    ]
+    saved = replace(map_of(*[WALL] * count, edges=motions), T_map_node=nodes)
+    ups = held[:, 2, :3] if is_known else [None] * count
+    submaps = [replace(one, up=up) for one, up in zip(saved.submaps, ups, strict=True)]
+    saved = replace(saved, submaps=tuple(submaps))
+    for here in (T_map_level @ T for T in ring):
+        stood = saved.standing(here)
+        assert np.linalg.norm(stood[:3, 2] - T_map_level[:3, 2]) < within_rad
+        np.testing.assert_allclose(stood[:2, 3], here[:2, 3], atol=1e-12)
+
+
 # What is covered.
 
 

@@ -13,15 +13,17 @@ from numpy.typing import NDArray
 from sceneslam.atlas.places.floor_plan import FloorPlan, check_size, join
 from sceneslam.atlas.submaps.graph import connected, fits
 from sceneslam.atlas.submaps.submap import Drawing, Submap
-from sceneslam.atlas.submaps.uprights import are_steady
+from sceneslam.atlas.submaps.uprights import are_on_floor, are_steady
 from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.motion.tilt import upright
 from sceneslam.types import planar, se3
 from sceneslam.types.maps import PoseGraphLayer
 from sceneslam.types.planar import Planar
-from sceneslam.types.se3 import Transform
+from sceneslam.types.se3 import Transform, Vector
 from sceneslam.views.placed_views import are_covered
 from sceneslam.views.view import Landmarks
+
+_UP = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -142,21 +144,34 @@ class SavedMap:
         """Return a pose (4, 4) with the height and tilt of a robot on the floor of a piece there.
 
         That is the floor of the submap that begins nearest to it. A base that is mounted askew has
-        the same tilt everywhere, whichever way it looks; on a ramp it has not.
+        the same tilt everywhere, whichever way it looks; on a ramp it has not. Where the map was
+        made by hand, the floor is level.
         """
-        nodes = self.T_map_node[self.pieces == piece]
+        own = self.nodes(piece)
+        nodes = self.T_map_node[own]
         askew = upright(se3.identity(), np.median(nodes[:, 2, :3], axis=0))
         ups_base = (np.tile(T[2, :3], (len(nodes), 1)) for T in (askew, se3.identity()))
         if not are_steady(nodes, *ups_base):
             askew = se3.identity()
-        T_map_node = self.T_map_node[self.nearest(T_map_base, piece)]
-        node, base = (
-            planar.from_transform(T @ se3.inverse(askew)) for T in (T_map_node, T_map_base)
-        )
-        on_floor = planar.to_transform(planar.between(node, base))
-        stood = T_map_node @ se3.inverse(askew) @ on_floor @ askew
+        T_map_floor = self.T_map_node[self.nearest(T_map_base, piece)] @ se3.inverse(askew)
+        up_map = self._up(own, askew[2, :3])
+        motions = [edge for edge in self.edges if edge.kind is EdgeKind.MOTION]
+        motions = [edge for edge in motions if self.pieces[edge.first] == piece]
+        if not are_on_floor(motions, self.T_map_node, askew[2, :3], up_map):
+            level = upright(se3.identity(), up_map)
+            T_map_floor = se3.inverse(level) @ upright(level @ T_map_floor, _UP)
+            askew = se3.identity()
+        floor = planar.from_transform(T_map_floor)
+        base = planar.from_transform(T_map_base @ se3.inverse(askew))
+        stood = T_map_floor @ planar.to_transform(planar.between(floor, base)) @ askew
         stood[:2, 3] = T_map_base[:2, 3]
         return np.asarray(stood)
+
+    def _up(self, nodes: Sequence[int], up_node: Vector) -> Vector:
+        """Return the usual vertical direction (3,) in the map; `up_node` if none was measured."""
+        ups = [up_node if (up := self.submaps[node].up) is None else up for node in nodes]
+        mean = np.median(np.einsum("nij,nj->ni", self.T_map_node[nodes, :3, :3], ups), axis=0)
+        return np.asarray(mean / np.linalg.norm(mean))
 
     def graph(self) -> PoseGraphLayer:
         """Return nodes and edges as a layer."""

@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 from sceneslam.atlas.submaps.chain import Chain
 from sceneslam.atlas.submaps.graph import UPRIGHT_RAD, Upright
 from sceneslam.atlas.submaps.submap import Submap
+from sceneslam.graphs.edge import Edge
 from sceneslam.motion.tilt import upright
 from sceneslam.types import se3
+from sceneslam.types.se3 import Vector
 
 
 def straightened(chain: Chain) -> list[Submap]:
@@ -46,6 +48,24 @@ def are_steady(
         for each in (ups, others)
     )
     return bool((changes**2).sum() <= (least**2).sum() + UPRIGHT_RAD**2)
+
+
+def are_on_floor(
+    motions: Sequence[Edge], T_map_node: NDArray[np.float64], up_node: Vector, up_map: Vector
+) -> bool:
+    """Tell whether motions lie in the floor of their nodes (N, 4, 4) as well as in a level one.
+
+    `up_node` (3,) is the normal of the first, in every node, `up_map` that of the second. A robot
+    moves in the plane that it stands on; what is carried by hand tilts whichever way it moves.
+    """
+    T_first_second = np.array([motion.T_first_second for motion in motions]).reshape(-1, 4, 4)
+    firsts = T_map_node[[motion.first for motion in motions], :3, :3]
+    steps = T_first_second[:, :3, 3]
+    ups = 0.5 * (up_node + T_first_second[:, :3, :3] @ up_node)
+    off_floor_m = (steps * ups).sum(axis=1)
+    climbed_m = np.einsum("i,nij,nj->n", up_map, firsts, steps)
+    uneven_m = UPRIGHT_RAD * np.linalg.norm(steps, axis=1)
+    return bool((off_floor_m**2).sum() <= (climbed_m**2 + uneven_m**2).sum())
 
 
 def uprights(
