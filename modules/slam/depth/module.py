@@ -182,7 +182,7 @@ class DepthSlam(LocalModule, Checked):
     def _add_keyframe(
         self, surface: Surface, T_local_cam: se3.Transform, covariance: Doubles
     ) -> None:
-        """Add a keyframe at a pose, tracked by the last one, with its covariance (6, 6), in base."""
+        """Add a keyframe at a pose by the last reference, with its covariance (6, 6), in base."""
         tracked_by, self._reference = self._reference, self._map.add(surface, T_local_cam)
         in_cam = se3.carried(covariance, se3.inverse(self._camera.T_base_cam))
         self._graph.connect(self._reference, in_cam, tracked_by=tracked_by)
