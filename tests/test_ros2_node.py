@@ -17,13 +17,16 @@ from hydra import compose, initialize_config_module
 from hydra.utils import instantiate
 from isolation import limits
 from omegaconf import OmegaConf
+from rosbags.typesys import Stores, get_typestore
 
 from sceneslam.config.check import check_node
 from sceneslam.config.echo import check_echo
 from sceneslam.modules.slam.process.client import LOST, TRACKING
+from sceneslam.modules.slam.process.fields import observation_fields
 from sceneslam.modules.slam.ros2_node.client import NodeClient
 from sceneslam.modules.slam.ros2_node.listener import NodeListener, moved
 from sceneslam.modules.slam.ros2_node.module import NodeTopics, Ros2Node
+from sceneslam.ros import decode, names
 from sceneslam.ros.encode import Encoder
 from sceneslam.ros.encode_results import ResultEncoder
 from sceneslam.ros.transport.transport import Arrival, Network
@@ -31,7 +34,7 @@ from sceneslam.testing import RIG, room_observation
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError, InputError, ModuleError
 from sceneslam.types.maps import GridLayer
-from sceneslam.types.observation import TrackingStatus
+from sceneslam.types.observation import Observation, TrackingStatus
 from sceneslam.types.rig import Sensor
 
 pytest.importorskip("cyclonedds", reason="cyclonedds is not installed: pip install sceneslam[ros2]")
@@ -218,6 +221,31 @@ def test_a_node_that_stops_publishing_tf_gives_no_poses(monkeypatch, tf_age_max_
     assert [count(100.9), count(101.1)] == [1, is_kept]
     node.publish(np.eye(4))
     assert count(101.2) == 1
+
+
+def test_a_node_that_answers_sweeps_by_their_headers_has_a_pose_for_each():
+    """The middle of a sweep is 50 ms after the observation, as of a scan with time_increment."""
+    heard, headers_ns = {}, []
+    store = get_typestore(Stores.ROS2_HUMBLE)
+
+    def answer(cdr):
+        message = store.deserialize_cdr(cdr, "sensor_msgs/msg/LaserScan")
+        headers_ns.append(decode.stamp_ns(message))
+        pose = Encoder().odometry(headers_ns[-1], np.eye(4), names.MAP)
+        heard["/pose"](Arrival(topic="/pose", cdr=pose, arrived_ns=0))
+
+    transport = SimpleNamespace(
+        subscribe=lambda topic, kind, hear, qos: heard.update({topic: hear}),
+        publisher=lambda *topic: SimpleNamespace(publish=answer),
+    )
+    settings = {"pose_kind": "odometry", "map_kind": "grid", "needs": ["scan"], "answer_s": 0.01}
+    settings |= {"topics": NONE | {"scan": "/scan", "pose": "/pose"}, "deviation_max_m": 1.0}
+    client = NodeClient(settings)
+    client._transport, client._camera, client._T_frame_base = transport, None, np.eye(4)
+    client._heard = NodeListener(transport, settings)
+    scan = replace(room_observation(0).scan, stamp_ns=150_000_000)
+    reply = client.track(observation_fields(Observation(stamp_ns=100_000_000, scan=scan)))
+    assert headers_ns == reply["stamps_ns"].tolist() == [100_000_000]
 
 
 def test_a_node_is_started_on_the_domain_of_its_module():

@@ -106,7 +106,7 @@ class Robot:
         if topic == "/imu":
             return encoder.imu(stamp_ns, {Sensor.GYRO: np.array([0.0, 0.0, 0.5])})
         if topic.endswith("/scan"):
-            return encoder.scan(scan(stamp_ns))
+            return encoder.scan(stamp_ns, scan(stamp_ns))
         if topic == INFO:
             return encoder.camera_info(stamp_ns, CAMERA)
         if topic.endswith(names.TF_STATIC):

@@ -79,16 +79,20 @@ class Encoder:
             data=data.ravel(),
         )
 
-    def scan(self, scan: LaserScan) -> bytes:
-        """Return a LaserScan message; its angles and ranges are float32."""
+    def scan(self, stamp_ns: int, scan: LaserScan) -> bytes:
+        """Return a LaserScan message of an observation; angles, ranges and times are float32.
+
+        A sweep whose middle is later than the observation begins with it.
+        """
         last = max(len(scan.ranges_m) - 1, 0)
+        begun_ns = min(stamp_ns, scan.stamp_ns)
         return self._cdr(
             names.TYPES[names.SCAN],
-            header=self._header(scan.stamp_ns, names.LASER),
+            header=self._header(begun_ns, names.LASER),
             angle_min=scan.angle_min_rad,
             angle_max=scan.angle_min_rad + scan.angle_step_rad * last,
             angle_increment=scan.angle_step_rad,
-            time_increment=0.0,
+            time_increment=2e-9 * (scan.stamp_ns - begun_ns) / max(last, 1),
             scan_time=0.0,
             range_min=scan.range_min_m,
             range_max=scan.range_max_m,

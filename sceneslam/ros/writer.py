@@ -30,8 +30,8 @@ _DEPTH_UNITS_PER_M = 1000.0
 class ObservationWriter:
     """Records observations so that `sources.rosbag` reads the same ones.
 
-    Colour is stored as JPEG or PNG, depth as 16-bit PNG in mm, other values exactly (angles and
-    ranges of a LaserScan are float32). The file opens in Foxglove.
+    Colour is stored as JPEG or PNG, depth as 16-bit PNG in mm, other values exactly (angles,
+    ranges and times of a LaserScan are float32). The file opens in Foxglove.
     """
 
     def __init__(self, path: Path, *, rig: Rig, image_format: str, jpeg_quality: int = 95) -> None:
@@ -68,7 +68,8 @@ class ObservationWriter:
             data = encoder.odometry(stamp_ns, observation.T_odom_base, names.ODOM)
             self._add(names.ODOMETRY, stamp_ns, data)
         if observation.scan is not None:
-            self._add(names.SCAN, observation.scan.stamp_ns, encoder.scan(observation.scan))
+            data = encoder.scan(stamp_ns, observation.scan)
+            self._add(names.SCAN, observation.scan.stamp_ns, data)
         if observation.points_lidar is not None:
             data = encoder.points(stamp_ns, observation.points_lidar, observation.point_times_s)
             self._add(names.POINTS, stamp_ns, data)

@@ -94,7 +94,7 @@ class FoxgloveSink(TopicSink):
             self.send(names.TF, self.encoder.transforms(stamp_ns, names.ODOM, children))
         if scan is not None:
             scan = replace(scan, stamp_ns=scan.stamp_ns - self._shift_ns)
-            self._show(names.SCAN, self.encoder.scan(scan))
+            self._show(names.SCAN, self.encoder.scan(scan.stamp_ns, scan))
         if observation.image_bgr is not None:
             self._show_image(stamp_ns, observation.image_bgr)
         super().write(observation, T_map_base, module)

@@ -171,7 +171,7 @@ class NodeClient:
         for at_ns, measured in _inertial(stamp_ns, observation).items():
             self._publish("imu", encoder.imu, at_ns, measured)
         if "scan.ranges_m" in observation:
-            self._publish("scan", encoder.scan, _scan(observation))
+            self._publish("scan", encoder.scan, stamp_ns, _scan(observation))
         points, times_s = observation.get("points_lidar"), observation.get("point_times_s")
         if points is not None:
             self._publish("points", encoder.points, stamp_ns, points, times_s)
