@@ -119,6 +119,34 @@ def test_what_is_recorded_is_read_back(tmp_path: Path) -> None:
         assert after.scan.range_max_m == before.scan.range_max_m
 
 
+@pytest.mark.parametrize("has_camera", [False, True])
+def test_scans_whose_sweeps_end_after_their_observations_are_read_back(
+    tmp_path: Path, has_camera: bool
+) -> None:
+    """A camera's pace is 33 ms; a scan, of every third image, is half a sweep of 100 ms ahead."""
+    sensors = {Sensor.SCAN, Sensor.ODOMETRY} | ({Sensor.IMAGE} if has_camera else set())
+    rig = replace(RIG, sensors=frozenset(sensors), lidar=None)
+    made = []
+    for index, seen in enumerate(observations(9)):
+        is_swept = index % 3 == 0 or not has_camera
+        ahead = replace(seen.scan, stamp_ns=seen.stamp_ns + 50_000_000)
+        one = Observation(stamp_ns=seen.stamp_ns, T_odom_base=seen.T_odom_base)
+        one = replace(one, scan=ahead if is_swept else None)
+        made.append(replace(one, image_bgr=seen.image_bgr if has_camera else None))
+    writer = ObservationWriter(tmp_path / "run.mcap", rig=rig, image_format="png")
+    for one in made:
+        writer.write(one)
+    writer.close()
+    read = list(make_source("mcap", tmp_path / "run.mcap"))
+    assert [one.stamp_ns for one in read] == [one.stamp_ns for one in made]
+    for before, after in zip(made, read, strict=True):
+        np.testing.assert_allclose(after.T_odom_base, before.T_odom_base, atol=1e-14)
+        assert (after.scan is None) == (before.scan is None)
+        if after.scan is not None:
+            assert abs(after.scan.stamp_ns - before.scan.stamp_ns) < 10  # float32
+            np.testing.assert_array_equal(after.scan.ranges_m, before.scan.ranges_m)
+
+
 def test_rig_and_truth_are_read_back(tmp_path: Path) -> None:
     expected = truth(record(tmp_path / "run.mcap"))
     source = make_source("mcap", tmp_path / "run.mcap")

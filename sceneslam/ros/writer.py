@@ -69,7 +69,7 @@ class ObservationWriter:
             self._add(names.ODOMETRY, stamp_ns, data)
         if observation.scan is not None:
             data = encoder.scan(stamp_ns, observation.scan)
-            self._add(names.SCAN, observation.scan.stamp_ns, data)
+            self._add(names.SCAN, stamp_ns, data)
         if observation.points_lidar is not None:
             data = encoder.points(stamp_ns, observation.points_lidar, observation.point_times_s)
             self._add(names.POINTS, stamp_ns, data)
