@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from sceneslam.sources.bag.synchronise import Sample, SynchronisedSamples, Synchroniser
+from sceneslam.sources.faults import FaultLog
 from sceneslam.sources.prefetch import prefetched
 from sceneslam.types import se3
 from sceneslam.types.rig import Sensor
@@ -135,6 +136,29 @@ def test_clock_of_one_sensor_does_not_take_the_others_apart(ahead_s: int) -> Non
     found += synchroniser.flush()
     assert len(found) == 100
     assert all(one.depth and one.depth.value == one.primary.value for one in found)
+
+
+@pytest.mark.parametrize("bad", [0, 20])
+@pytest.mark.parametrize("sensor", [Sensor.IMAGE, Sensor.DEPTH, Sensor.ODOMETRY, Sensor.GYRO])
+def test_one_stamp_ahead_costs_one_sample_and_is_counted(sensor: Sensor, bad: int) -> None:
+    streams = (Sensor.IMAGE, Sensor.DEPTH, Sensor.ODOMETRY, Sensor.GYRO)
+    faults = FaultLog()
+    synchroniser = Synchroniser(Sensor.IMAGE, frozenset(streams), 0.02, faults=faults)
+    found: list[SynchronisedSamples] = []
+    for number in range(100):
+        for each in streams:
+            at_ns = number * 33 * MS
+            ahead_ns = 10**12 if (each, number) == (sensor, bad) else 0
+            value = se3.identity() if each is Sensor.ODOMETRY else number
+            sample = Sample(stamp_ns=at_ns + ahead_ns, arrived_ns=at_ns, value=value)
+            found += synchroniser.add(each, sample)
+    found += synchroniser.flush()
+    assert len(found) >= 99
+    assert sum(one.depth is None for one in found) <= 1
+    assert sum(one.T_odom_base is None for one in found) <= 2
+    assert sum(len(one.samples[Sensor.GYRO]) for one in found) >= 98
+    (fault,) = faults.sentences()
+    assert f"{sensor.value} left out, its stamp is ahead of the next one: 1 time" in fault
 
 
 def live_sets(

@@ -176,7 +176,9 @@ class RosBag:
     def _bundles(self) -> Iterator[tuple[SynchronisedSamples, Sensor]]:
         """Yield synchronised samples, each with its primary sensor."""
         topics, primary = frozenset(self._by_sensor.values()), self._primary
-        synchroniser = Synchroniser(primary, frozenset(self._by_sensor), self._sync_tolerance_s)
+        synchroniser = Synchroniser(
+            primary, frozenset(self._by_sensor), self._sync_tolerance_s, faults=self._faults
+        )
         begin_ns = min((one.log_ns for one in self._firsts.values()), default=0)
         paced = {one: self._by_sensor[one] for one in (self._primary, *self._firsts)}
         pace = StreamPace(paced, self._silent_after_s, begin_ns)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from sceneslam.sources.faults import FaultLog, at_stamp
 from sceneslam.types import se3
 from sceneslam.types.rig import Sensor
 from sceneslam.types.se3 import Transform
@@ -16,7 +17,7 @@ from sceneslam.types.se3 import Transform
 _PATIENCE_S = 1.0  # longest wait of a message for a stream that is behind
 _LATE_NS = 250_000_000  # longest delay of depth that is waited for: later poses steer no robot
 _DELAYS = 30  # depth images whose delays count: of a second
-_REACH_NS = 1_000_000_000  # older samples are not used
+_REACH_NS = 1_000_000_000  # older samples are not used; nor is one so far ahead of the next
 _ODOMETRY_GAP_NS = 1_000_000_000  # longest gap for interpolation of odometry
 _ODOMETRY_HOLD_NS = 100_000_000  # validity before the first and after the last odometry
 _MOST_HELD = 4096  # queued samples per stream
@@ -50,7 +51,8 @@ class Synchroniser:
 
     A set waits for the streams in `waits_for` (None: all) until any sample has arrived `patience_s`
     later, for depth until so long after it is due, as encoded depth comes later than its image.
-    Stamps do not measure this wait: one sensor's clock can be ahead of the others'.
+    Stamps do not measure this wait: one sensor's clock can be ahead of the others'. A queued sample
+    that is ahead of the next one of its stream is dropped, and counted in `faults`.
     """
 
     def __init__(
@@ -62,7 +64,9 @@ class Synchroniser:
         waits_for: frozenset[Sensor] | None = None,
         patience_s: float = _PATIENCE_S,
         extrapolates: bool = False,  # odometry that is late
+        faults: FaultLog | None = None,
     ) -> None:
+        self._faults = faults or FaultLog()
         self._primary = primary
         self._extrapolates = extrapolates
         self._waits_for = streams if waits_for is None else waits_for
@@ -72,7 +76,7 @@ class Synchroniser:
         self._held: dict[Sensor, deque[Sample]] = {
             sensor: deque(maxlen=_MOST_HELD) for sensor in streams - {primary}
         }
-        self._seen_ns: dict[Sensor, int] = {}  # the latest stamp of each stream
+        self._seen_ns: dict[Sensor, int] = {}  # the stamp of each stream's newest sample
         self._arrived_ns = 0  # the latest arrival
         self._delays_ns: deque[int] = deque(maxlen=_DELAYS)  # of depth, from stamp to arrival
         self._taken_ns: dict[Sensor, int] = {}  # the newest sample used in a set
@@ -81,8 +85,12 @@ class Synchroniser:
 
     def add(self, sensor: Sensor, sample: Sample) -> Iterator[SynchronisedSamples]:
         """Add a sample; yield the sets that are complete now."""
-        (self._waiting if sensor is self._primary else self._held[sensor]).append(sample)
-        self._seen_ns[sensor] = max(self._seen_ns.get(sensor, 0), sample.stamp_ns)
+        queue = self._waiting if sensor is self._primary else self._held[sensor]
+        while queue and queue[-1].stamp_ns > sample.stamp_ns + _REACH_NS:
+            fault = f"{sensor.value} left out, its stamp is ahead of the next one"
+            self._faults.add(fault, at_stamp(queue.pop().stamp_ns))
+        queue.append(sample)
+        self._seen_ns[sensor] = sample.stamp_ns
         self._arrived_ns = max(self._arrived_ns, sample.arrived_ns)
         if sensor is Sensor.DEPTH:
             self._delays_ns.append(sample.arrived_ns - sample.stamp_ns)

@@ -249,6 +249,7 @@ class Ros2(Measuring):
             waits_for=streams.waits_for,
             patience_s=_PATIENCE_S,
             extrapolates=True,
+            faults=self._faults,
         )
         types = {topic: self.heard.topics[topic].msgtype for topic in self._by_sensor.values()}
         stamp_ns = asked_ns = 0
