@@ -11,7 +11,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from contextlib import nullcontext
+from contextlib import closing, nullcontext
 from pathlib import Path
 from time import monotonic, sleep
 from types import SimpleNamespace
@@ -146,6 +146,42 @@ def test_stopped_sweep_goes_on_where_it_was_by_the_same_command(folder):
     assert code == 0 and "(2 of them before)" in out
 
 
+@pytest.mark.parametrize("subdir", ["0", "jobs/first"])
+def test_sweep_that_was_moved_goes_on_where_it_is(folder, subdir):
+    words = (*JOBS, "policy.retry_s=0", f"hydra.sweep.subdir={subdir}", "hydra.sweep.dir=out")
+    assert sweep(folder, *words)[0] == 0
+    (folder / "out").rename(folder / "moved")
+    job = folder / "moved" / subdir
+    Status.read(job).now(State.STOPPED).write(job)
+    before_ns = (job / "metrics.json").stat().st_mtime_ns
+    assert main([str(folder / "moved")]) == 0
+    assert (job / "metrics.json").stat().st_mtime_ns > before_ns
+    assert not (folder / "out").exists()
+
+
+def test_sweep_that_runs_is_not_resumed_beside_itself(tmp_path, capsys):
+    folders = ended(tmp_path, State.DONE)
+    run_sweep(tmp_path, folders, {"backend": "basic"}, tmp_path)
+    script = "import sys; from sceneslam.sweep.__main__ import main; sys.exit(main(sys.argv[1:]))"
+    with closing(RunFolder.claim(tmp_path, kind="sweep")):
+        words = [sys.executable, "-c", script, str(tmp_path)]
+        own = os.environ | {"PYTHONPATH": str(ROOT)}
+        done = subprocess.run(words, env=own, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2 and "a folder that no run is writing; process" in done.stderr
+    assert main([str(tmp_path)]) == 0
+
+
+def test_sweep_whose_working_folder_is_missing_is_named(tmp_path, capsys):
+    folders = ended(tmp_path / "out", State.DONE)
+    run_sweep(tmp_path / "out", folders, {"backend": "basic"}, tmp_path / "here")
+    assert main([str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err
+    assert (
+        error.startswith("error: the folder in which the sweep began is missing")
+        and "here" in error
+    )
+
+
 def test_job_whose_configuration_changed_is_run_again(folder):
     words = (*JOBS, "hydra.sweep.dir=out")
     assert sweep(folder, *words, "policy.retry_s=0,1")[0] == 0
@@ -156,6 +192,7 @@ def test_job_whose_configuration_changed_is_run_again(folder):
 
 def ended(sweep, *states):
     """Give the folders of jobs that ended in these states."""
+    RunFolder.claim(sweep, kind="sweep").close()  # as Hydra's callback
     folders = [sweep / str(number) for number in range(len(states))]
     for folder, state in zip(folders, states, strict=True):
         folder.mkdir(parents=True)

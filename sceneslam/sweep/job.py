@@ -16,7 +16,7 @@ from hydra._internal.hydra import Hydra
 from hydra._internal.utils import create_config_search_path
 from hydra.core.utils import run_job
 from hydra.types import HydraContext
-from omegaconf import DictConfig
+from omegaconf import DictConfig, open_dict, read_write
 
 from sceneslam.cli import CONFIG, INCOMPLETE, OK, Ended, carry_out
 from sceneslam.collect.status import State, Status
@@ -43,6 +43,7 @@ def _run(folder: Path) -> tuple[State, str]:
     try:
         with (folder / COMPOSED).open("rb") as file:
             config: DictConfig = pickle.load(file)
+        _place(config, folder)
         ended = _carried_out(config)
     except KeyboardInterrupt:
         return State.STOPPED, "stopped while it ran"
@@ -50,6 +51,14 @@ def _run(folder: Path) -> tuple[State, str]:
         traceback.print_exc()
         return State.FAILED, f"unexpected {type(error).__name__}: {error}; see job.log"
     return _STATES.get(ended.code, State.FAILED), "; ".join(ended.errors)
+
+
+def _place(config: DictConfig, folder: Path) -> None:
+    """Set where a job is: its sweep may have been moved since it was composed."""
+    depth = len(Path(str(config.hydra.sweep.subdir)).parts)
+    with read_write(config.hydra), open_dict(config.hydra):
+        config.hydra.sweep.dir = str(folder.parents[depth - 1])
+        config.hydra.runtime.output_dir = str(folder)
 
 
 def _carried_out(config: DictConfig) -> Ended:

@@ -6,6 +6,7 @@ import json
 import sys
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from sceneslam.collect.rows import rows_of
 from sceneslam.collect.status import State, Status
 from sceneslam.collect.write import write_rows
 from sceneslam.interrupts import termination_noted
+from sceneslam.storage.folder import RunFolder
 from sceneslam.sweep.backends import BACKENDS, Backend
 from sceneslam.sweep.progress import Progress
 from sceneslam.sweep.snapshot import keep_code
@@ -81,7 +83,10 @@ def resume(sweep: Path) -> bool:
         if Status.read(folder) is None:
             how = f"give the sweep's command again, with hydra.sweep.dir={sweep}"
             raise InputError(f"a job's folder or status is missing ({how}): {folder}")
-    return run_sweep(sweep, folders, launcher, began_in)
+    if not began_in.is_dir():
+        raise InputError(f"the folder in which the sweep began is missing: {began_in}")
+    with closing(RunFolder.claim(sweep, kind="sweep")):
+        return run_sweep(sweep, folders, launcher, began_in)
 
 
 def _tell(sweep: Path, folders: Sequence[Path], *, skipped: int) -> None:
