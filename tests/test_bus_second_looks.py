@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from driving import GATE, TABLE, assert_exact, drive, events, policy
+from driving import GATE, TABLE, assert_exact, dark_from, drive, events, policy
 from fakes import (
     PERIOD_NS,
     RIG,
@@ -22,6 +22,7 @@ from sceneslam.bus.scene.scene_filter import WindowFilter
 from sceneslam.storage.events import EventLog
 from sceneslam.types import se3
 from sceneslam.types.observation import SceneVote, TrackingStatus
+from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.trajectory import Trajectory
 
 ALONE = {"Bright": ["bright"], "Dark": ["bright"]}
@@ -225,6 +226,33 @@ def test_a_loop_closed_after_the_scene_changed_is_kept_at_the_hand_over(
     for path in (atlas.online, atlas.trajectory):
         off_m = path.T_world_base[-1, :3, 3] - true_pose(229 * PERIOD_NS)[:3, 3]
         assert np.linalg.norm(off_m) < 1e-6
+
+
+class Revising(ExactModule):
+    """It says that it corrected its past: after a loss from 50 to 75, or at every observation."""
+
+    def __init__(self, *, is_lost):
+        super().__init__(lost=range(50, 75) if is_lost else ())
+        self.is_lost = is_lost
+
+    def track(self, observation):
+        index = observation.stamp_ns // PERIOD_NS
+        return replace(super().track(observation), revision=index // 60 if self.is_lost else index)
+
+
+@pytest.mark.parametrize("is_lost", [True, False])
+def test_a_motion_that_nothing_bridges_is_no_correction(is_lost):
+    """Dark is confirmed at 76, but its module begins where it became dark."""
+    _, atlas, log, _ = drive(
+        {"bright": Revising(is_lost=is_lost), "dark": ExactModule()},
+        scene_at=dark_from(56),
+        rig=Rig(sensors=frozenset({Sensor.IMAGE})),
+        handover="rewind",
+        has_odometry=False,
+        lost_patience_s=60.0,
+    )
+    assert [(at, to) for at, to, _ in decisions(log)] == [(0, "bright"), (76, "dark")]
+    assert_exact(atlas)
 
 
 def test_a_late_first_pose_without_odometry_continues_the_motion_that_was_known():

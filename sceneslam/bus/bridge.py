@@ -27,6 +27,11 @@ class Bridge:
         """Return the last pose, measured or predicted; the identity before the first."""
         return se3.identity() if self._T_map_base is None else self._T_map_base
 
+    @property
+    def has_velocity(self) -> bool:
+        """Tell whether a velocity is known; without one, the robot is assumed to stand still."""
+        return self._before is not None
+
     def unknown_s(self, stamp_ns: int) -> float:
         """Return the time [s] since the last pose that is known; 0 before the first."""
         return 0.0 if self._known is None else (stamp_ns - self._known[0]) / 1e9

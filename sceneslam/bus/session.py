@@ -38,7 +38,8 @@ class ModuleSession:
         self.runner, self.hold, self.bridge = runner, hold, bridge
         self.is_placed = False
         self._has_gap = False  # a pose was unknown since the last one that was tracked
-        self.T_new_old: Transform | None = None  # how the last answer corrected its past, in map
+        # How the last answer corrected its past, in map; unknown where nothing bridges the motion.
+        self.T_new_old: Transform | None = None
         self.tracking: Tracking | None = None  # of the last observation, where its pose is used
         self.fault: ModuleError | None = None  # failure at the last observation
         self.stored: list[int] = []  # its sessions in the back end
@@ -150,9 +151,11 @@ class ModuleSession:
         assert self.runner is not None and self.runner.T_map_local is not None
         T_map_base = self.runner.T_map_local @ tracking.T_local_base
         if self.hold.is_revised:
-            T_map_old = self.bridge.copy().predict(self._believed(observation), by_velocity=True)
-            T_map_old = self.bridge.T_map_base if T_map_old is None else T_map_old
-            self.T_new_old = T_map_base @ se3.inverse(T_map_old)
+            T_map_old = self.bridge.copy().predict(
+                self._believed(observation), by_velocity=self.bridge.has_velocity
+            )
+            if T_map_old is not None:
+                self.T_new_old = T_map_base @ se3.inverse(T_map_old)
         self.bridge.update(observation, T_map_base, is_jump=self.hold.is_revised)
         self._has_gap = False
         return T_map_base
