@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sceneslam.ros import pixels
 from sceneslam.types import se3
 from sceneslam.types.errors import InputError
-from sceneslam.types.observation import LaserScan
+from sceneslam.types.observation import SWEEP_MAX_S, LaserScan
 from sceneslam.types.rig import Camera, Sensor
 from sceneslam.types.se3 import Transform
 
@@ -40,7 +40,6 @@ _COLOR: dict[str, tuple[str, int, int | None]] = {
 }
 _DEPTH = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 _COMPRESSED_DEPTH_HEADER = 12  # bytes: a format number and two float32 parameters
-_SWEEP_MAX_S = 0.5  # no planar laser turns slower
 
 
 def stamp_ns(message: Any) -> int:
@@ -192,7 +191,7 @@ def scan(message: Any, stamp_ns: int) -> LaserScan | None:
 def _sweep_s(message: Any) -> float:
     """Return the time from the first beam of a LaserScan to the last, 0 if it is not known."""
     sweep_s = abs(float(message.time_increment)) * (len(message.ranges) - 1)
-    return sweep_s if sweep_s < _SWEEP_MAX_S else 0.0  # 0 for NaN, too
+    return sweep_s if sweep_s < SWEEP_MAX_S else 0.0  # 0 for NaN, too
 
 
 def camera(message: Any, *, is_rectified: bool = False) -> Camera | None:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from sceneslam.types.rig import Sensor
 from sceneslam.types.se3 import Transform, hat
 
+SWEEP_MAX_S = 0.5  # no planar laser turns slower
 _GYRO_GAP_S = 0.1  # a turn rate is not extrapolated over a longer gap
 UNSURE = "Unsure"  # the scene of a vote that could not be cast
 

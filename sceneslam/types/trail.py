@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.types import se3
+from sceneslam.types.observation import SWEEP_MAX_S
 from sceneslam.types.se3 import Transform
 
 _KEPT_NS = 1_000_000_000  # no driver is later
-_AHEAD = 2.0  # last motions: the middle of a sweep is not further ahead
 
 
 @dataclass(slots=True)
@@ -35,12 +35,13 @@ class Trail:
     def base_at(self, stamp_ns: int) -> Transform:
         """Return T_base_then (4, 4) [m]: the base at a stamp, in the newest.
 
-        Later than that it goes on as it moved last; the oldest one that is known is that before.
+        Later than that, by half a sweep at most, it goes on as it moved last; the oldest one that
+        is known is that before.
         """
         after = self._count_before(stamp_ns)
         if after == len(self._poses):
             ahead_s = 0.0 if not self._stamps_ns else (stamp_ns - self._stamps_ns[-1]) * 1e-9
-            return se3.exp(min(ahead_s, _AHEAD * self._step_s) * self.twist_s)
+            return se3.exp(min(ahead_s, SWEEP_MAX_S / 2) * self.twist_s)
         T_w_then = self._poses[after]
         if after > 0:
             first_ns, last_ns = self._stamps_ns[after - 1 : after + 1]
@@ -54,12 +55,8 @@ class Trail:
         if len(self._poses) < 2:
             return np.zeros(6)
         T_prev_base = se3.inverse(self._poses[-2]) @ self._poses[-1]
-        return np.asarray(se3.log(T_prev_base) / self._step_s)
-
-    @property
-    def _step_s(self) -> float:
-        last_ns = self._stamps_ns[-2:]
-        return (last_ns[-1] - last_ns[0]) * 1e-9 if last_ns else 0.0
+        step_s = (self._stamps_ns[-1] - self._stamps_ns[-2]) * 1e-9
+        return np.asarray(se3.log(T_prev_base) / step_s)
 
     def _count_before(self, stamp_ns: int) -> int:
         return bisect_left(self._stamps_ns, stamp_ns)

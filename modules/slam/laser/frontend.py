@@ -10,7 +10,13 @@ from numpy.typing import NDArray
 from sceneslam.motion.model import MotionModel
 from sceneslam.motion.motion import Motion
 from sceneslam.types.covariance import UNKNOWN_VELOCITY
-from sceneslam.types.observation import LaserScan, Observation, Tracking, TrackingStatus
+from sceneslam.types.observation import (
+    SWEEP_MAX_S,
+    LaserScan,
+    Observation,
+    Tracking,
+    TrackingStatus,
+)
 from sceneslam.types.planar import (
     Matrix,
     Planar,
@@ -298,8 +304,9 @@ def _is_better(match: Match, other: Match) -> bool:
 def _share(stamp_ns: int, before_ns: int | None, now_ns: int) -> float:
     """Return the position of a stamp between the last observation (0, or before) and this one (1).
 
-    The middle of a sweep may be later.
+    The middle of a sweep may be later, by half of the slowest one.
     """
     if before_ns is None or now_ns <= before_ns:
         return 1.0
-    return float(np.clip((stamp_ns - before_ns) / (now_ns - before_ns), 0.0, 3.0))
+    until_ns = min(stamp_ns, now_ns + round(SWEEP_MAX_S / 2 * 1e9))
+    return max(until_ns - before_ns, 0) / (now_ns - before_ns)
