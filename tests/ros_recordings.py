@@ -83,6 +83,7 @@ class Recorder:
         frame: str = "cam",
         is_bigendian: bool = False,
         padding: int = 0,
+        log_ns: int | None = None,  # None: recorded at its stamp
     ) -> None:
         order = ">" if is_bigendian else "<"
         rows = pixels.astype(pixels.dtype.newbyteorder(order)).reshape(len(pixels), -1)
@@ -98,7 +99,7 @@ class Recorder:
             step=data.shape[1],
             data=data.ravel(),
         )
-        self.add(topic, stamp_ns, message)
+        self.add(topic, stamp_ns if log_ns is None else log_ns, message)
 
     def compressed(self, topic: str, stamp_ns: int, data: bytes, encoding: str) -> None:
         message = self.new(

@@ -10,6 +10,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from rosbags.typesys import Stores, get_typestore
 
 from sceneslam.ros.encode import Encoder
+from sceneslam.sources.spanned import TimeSpan
 from sceneslam.sources.survey.preflight import preflight
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError, InputError
@@ -414,6 +415,37 @@ def test_a_scan_without_a_stamp_has_that_of_its_recording(tmp_path: Path) -> Non
         recorder.scan("/scan", 0, [1.0] * 20)
     (one,) = make_source("rosbag", tmp_path / "a.mcap")
     assert one.stamp_ns == one.scan.stamp_ns == STAMP_NS
+
+
+@pytest.mark.parametrize("lacking", [range(3), range(7, 10)])
+def test_messages_without_stamps_beside_stamped_ones_are_faults(
+    tmp_path: Path, lacking: range
+) -> None:
+    """As of a simulator whose clock is not there yet; its time begins at 0."""
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        for number in range(10):
+            after_ns = (number + 1) * 10**8
+            stamp_ns = 0 if number in lacking else after_ns
+            pose = odometry_message(stamp_ns)
+            recorder.add("/odom", STAMP_NS + after_ns, pose)
+            recorder.add("/ground_truth/odom", STAMP_NS + after_ns, pose)
+            recorder.image("/rgb", stamp_ns, COLOR, log_ns=STAMP_NS + after_ns)
+    source = make_source("rosbag", tmp_path / "a.mcap")
+    stamps_ns = [(number + 1) * 10**8 for number in range(10) if number not in lacking]
+    found = list(source)
+    assert [one.stamp_ns for one in found] == stamps_ns
+    assert all(one.has(Sensor.ODOMETRY) for one in found)
+    span = TimeSpan(start_ns=stamps_ns[0], end_ns=stamps_ns[-1])
+    assert source.span == (None if 9 in lacking else span)
+    assert source.survey().stream(Sensor.IMAGE).stamps_ns.tolist() == stamps_ns
+    assert source.ground_truth().trajectory.stamps_ns.tolist() == stamps_ns
+    for topic in ("/rgb", "/odom"):
+        assert any(f"a message of {topic} has no stamp: 3 times" in one for one in source.faults)
+
+
+def odometry_message(stamp_ns: int) -> Any:
+    data = Encoder().odometry(stamp_ns, se3.identity(), "odom")
+    return get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr(data, "nav_msgs/msg/Odometry")
 
 
 @pytest.mark.parametrize("range_max", [0.0, float("nan")])

@@ -7,7 +7,6 @@ from functools import cached_property, partial
 from itertools import islice
 from typing import Any
 
-from sceneslam.ros import decode
 from sceneslam.ros.pixels import DepthUnits
 from sceneslam.sources.bag.frames import FrameTree
 from sceneslam.sources.bag.observation import PRIMARY, BundleDecoder, Decoded, measured
@@ -23,6 +22,7 @@ from sceneslam.sources.bag.rig import (
     unplaced,
     unregistered,
 )
+from sceneslam.sources.bag.stamps import StampReader
 from sceneslam.sources.bag.synchronise import Sample, SynchronisedSamples, Synchroniser
 from sceneslam.sources.bag.topics import choose_topics, describe
 from sceneslam.sources.bag.truth import BASE, CAMERA, read_truth, unplaced_body
@@ -79,6 +79,7 @@ class RosBag:
         self._truth_frame = ground_truth_frame
         self._faults = FaultLog()
         self._recording = open_recording(self._path)
+        self._stamps = StampReader(self._recording)
         try:
             self._topics = choose_topics(self._recording, topics)
             self._by_sensor = sensor_topics(self._recording, self._topics)
@@ -114,13 +115,11 @@ class RosBag:
 
     @property
     def span(self) -> TimeSpan | None:
-        """Return the first and last stamp of the topics that set the pace there."""
+        """Return the first and last stamp of the topics that set the pace, None if one is missing."""
         if not self._firsts or not self._lasts:
             return None
         begin, end = self._paces()
-        return TimeSpan(
-            start_ns=self._stamp_ns(self._firsts[begin]), end_ns=self._stamp_ns(self._lasts[end])
-        )
+        return TimeSpan(start_ns=self._firsts[begin].stamp_ns, end_ns=self._lasts[end].stamp_ns)
 
     def __iter__(self) -> Iterator[Observation]:
         """Yield observations; decodes pixels ahead in threads."""
@@ -179,7 +178,7 @@ class RosBag:
         synchroniser = Synchroniser(
             primary, frozenset(self._by_sensor), self._sync_tolerance_s, faults=self._faults
         )
-        begin_ns = min((one.log_ns for one in self._firsts.values()), default=0)
+        begin_ns = min((one.arrived_ns for one in self._firsts.values()), default=0)
         paced = {one: self._by_sensor[one] for one in (self._primary, *self._firsts)}
         pace = StreamPace(paced, self._silent_after_s, begin_ns)
         for message in self._recording.messages(topics):
@@ -196,37 +195,38 @@ class RosBag:
         yield from ((one, primary) for one in synchroniser.flush())
 
     @cached_property
-    def _firsts(self) -> Mapping[Sensor, Message]:
-        """Return the first message of each sensor that can set the pace, by rank.
+    def _firsts(self) -> Mapping[Sensor, Sample]:
+        """Return the first stamped message of each sensor that can set the pace, by rank.
 
         It can if its clock agrees with that of the primary sensor: observations have rising stamps.
         """
-        found, delays_ns = {}, {}
+        found: dict[Sensor, Sample] = {}
         for sensor in (one for one in PRIMARY if one in self._by_sensor):
-            message = next(self._recording.messages({self._by_sensor[sensor]}), None)
-            if message is not None:
-                found[sensor] = message
-                delays_ns[sensor] = message.log_ns - self._stamp_ns(message)
+            stamped = map(self._stamped, self._recording.messages({self._by_sensor[sensor]}))
+            if (one := next(filter(None, stamped), None)) is not None:
+                found[sensor] = one
+        delays_ns = {sensor: one.arrived_ns - one.stamp_ns for sensor, one in found.items()}
         own_ns, apart_ns = delays_ns.get(self._primary), CLOCKS_APART_S * 1e9
         return {
-            sensor: message
-            for sensor, message in found.items()
+            sensor: one
+            for sensor, one in found.items()
             if own_ns is None or abs(delays_ns[sensor] - own_ns) <= apart_ns
         }
 
     @cached_property
-    def _lasts(self) -> Mapping[Sensor, Message]:
-        """Return the last message of each of the same sensors."""
-        found = {one: self._recording.last(self._by_sensor[one]) for one in self._firsts}
+    def _lasts(self) -> Mapping[Sensor, Sample]:
+        """Return the last message of each of the same sensors, if it has a stamp."""
+        lasts = {one: self._recording.last(self._by_sensor[one]) for one in self._firsts}
+        found = {sensor: self._stamped(one) for sensor, one in lasts.items() if one is not None}
         return {sensor: one for sensor, one in found.items() if one is not None}
 
     def _paces(self) -> Iterator[Sensor]:
         """Yield the sensors that set the pace at the beginning and at the end, if there are any."""
-        begin_ns = min((one.log_ns for one in self._firsts.values()), default=0)
-        end_ns = max((one.log_ns for one in self._lasts.values()), default=0)
+        begin_ns = min((one.arrived_ns for one in self._firsts.values()), default=0)
+        end_ns = max((one.arrived_ns for one in self._lasts.values()), default=0)
         for ends, at_ns in ((self._firsts, begin_ns), (self._lasts, end_ns)):
             near_ns = self._silent_after_s * 1e9
-            near = (sensor for sensor in ends if abs(ends[sensor].log_ns - at_ns) <= near_ns)
+            near = (sensor for sensor in ends if abs(ends[sensor].arrived_ns - at_ns) <= near_ns)
             yield from islice(near, 1)
 
     def _samples(self, message: Message) -> Iterator[tuple[Sensor, Sample]]:
@@ -237,7 +237,10 @@ class RosBag:
                 f"a message of {message.topic} makes no sense", at_stamp(message.log_ns)
             )
             return
-        stamp_ns = decode.stamp_ns(value) or message.log_ns
+        stamp_ns = self._stamps.stamp_ns(message, value)
+        if stamp_ns is None:
+            self._faults.add(f"a message of {message.topic} has no stamp", at_stamp(message.log_ns))
+            return
         for sensor in (one for one, topic in self._by_sensor.items() if topic == message.topic):
             held = measured(value, sensor, self._mounts)
             if held is not None:
@@ -246,9 +249,13 @@ class RosBag:
                 fault = f"a pose of {message.topic} is not a rigid transform"
                 self._faults.add(fault, at_stamp(stamp_ns))
 
-    def _stamp_ns(self, message: Message) -> int:
-        decoded = self._recording.decode(message)
-        return message.log_ns if decoded is None else decode.stamp_ns(decoded) or message.log_ns
+    def _stamped(self, message: Message) -> Sample | None:
+        """Return a decoded message, None without a stamp; an invalid one has its recording time."""
+        value, log_ns = self._recording.decode(message), message.log_ns
+        stamp_ns = log_ns if value is None else self._stamps.stamp_ns(message, value)
+        if stamp_ns is None:
+            return None
+        return Sample(stamp_ns=stamp_ns, arrived_ns=log_ns, value=value)
 
     def _choose_primary(self) -> Sensor:
         for sensor in PRIMARY:

@@ -10,6 +10,7 @@ import numpy as np
 from sceneslam.ros import decode
 from sceneslam.sources.bag.frames import FrameTree, has_base_name
 from sceneslam.sources.bag.recording import Recording
+from sceneslam.sources.bag.stamps import StampReader
 from sceneslam.sources.bag.topics import BagTopics, first
 from sceneslam.types import se3
 from sceneslam.types.rig import Rig
@@ -79,11 +80,13 @@ def _is_pose(recording: Recording, topic: str) -> bool:
 
 def _trajectory(recording: Recording, topic: str, T_tracked_base: Transform) -> Trajectory:
     poses: dict[int, Transform] = {}
+    stamps = StampReader(recording)
     for message in recording.messages({topic}):
         decoded = recording.decode(message)
         T_gt_tracked = None if decoded is None else _pose(decoded)
-        if T_gt_tracked is not None:
-            poses[decode.stamp_ns(decoded) or message.log_ns] = T_gt_tracked @ T_tracked_base
+        stamp_ns = None if decoded is None else stamps.stamp_ns(message, decoded)
+        if T_gt_tracked is not None and stamp_ns is not None:
+            poses[stamp_ns] = T_gt_tracked @ T_tracked_base
     if not poses:
         return Trajectory.empty()
     stamps_ns = np.array(sorted(poses), dtype=np.int64)

@@ -13,6 +13,7 @@ from sceneslam.ros.clouds import cloud
 from sceneslam.ros.pixels import DepthUnits
 from sceneslam.sources.bag.observation import Mounts, measured
 from sceneslam.sources.bag.recording import Message, Recording
+from sceneslam.sources.bag.stamps import StampReader
 from sceneslam.sources.survey.survey import Stamps, Stream, Survey
 from sceneslam.types.rig import Sensor
 
@@ -43,13 +44,14 @@ def survey_recording(
     start_ns = min((one.log_ns for one in firsts), default=0)
     end_ns = max((one.log_ns for one in lasts), default=0)
     samples = _Samples(topics, DepthUnits.unlimited(depth_scale), mounts)
+    stamps = StampReader(recording)
     for stretch in (firsts, *_stretches(recording, used, start_ns, end_ns), lasts):
         samples.begin()
         for message in stretch:
             value = recording.decode(message)
-            if value is None:
+            stamp_ns = None if value is None else stamps.stamp_ns(message, value)
+            if stamp_ns is None:
                 continue
-            stamp_ns = decode.stamp_ns(value) or message.log_ns
             for sensor in (one for one, topic in topics.items() if topic == message.topic):
                 samples.take(sensor, stamp_ns, value, delay_ns=message.log_ns - stamp_ns)
     streams = [
