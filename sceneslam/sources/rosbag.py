@@ -115,7 +115,7 @@ class RosBag:
 
     @property
     def span(self) -> TimeSpan | None:
-        """Return the first and last stamp of the topics that set the pace, None if one is missing."""
+        """Return the first and last stamp of what sets the pace there, None if one is missing."""
         if not self._firsts or not self._lasts:
             return None
         begin, end = self._paces()
