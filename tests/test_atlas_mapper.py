@@ -219,7 +219,7 @@ def test_a_run_is_saved_as_a_piece_of_its_own_until_it_was_located(monkeypatch):
     np.testing.assert_allclose(saved.plane[2], [1.0, 2.0 + step[0], np.pi / 2], atol=1e-9)
 
 
-def test_loops_lead_between_the_first_poses_of_submaps_or_from_the_loaded_map(monkeypatch):
+def test_loops_lead_between_the_middles_of_submaps_or_from_the_loaded_map(monkeypatch):
     Searched(monkeypatch)
     own, _, observe = looking(speed_m_s=1.0)
     for second in range(60):
@@ -230,8 +230,11 @@ def test_loops_lead_between_the_first_poses_of_submaps_or_from_the_loaded_map(mo
     loops = edge(0, 3), edge(2, 20, (1, 0, 0), EdgeKind.LOOP)
     own._solved = replace(own._solved, loops=loops)
     found = own.loops(np.arange(60) * S)
-    assert [(loop.first, loop.second) for loop in found] == [(LOADED, 6), (3, 57)]
-    np.testing.assert_allclose(found[1].T_first_second, planar.to_transform(np.array([1.0, 0, 0])))
+    assert [(loop.first, loop.second) for loop in found] == [(LOADED, 7), (4, 58)]
+    for loop, measured, x_m in zip(found, loops, (2.0, 1.0), strict=True):  # a middle is at 1 m
+        np.testing.assert_allclose(loop.T_first_second, se3.from_xy_yaw(x_m, 0.0, 0.0))
+        swung = loop.covariance[1, 1] - measured.covariance[1, 1]
+        assert swung == pytest.approx(measured.covariance[5, 5])
 
 
 def test_a_map_is_saved_as_the_graph_moved_it_with_the_loops_that_modules_closed(monkeypatch):

@@ -31,7 +31,7 @@ from sceneslam.atlas.submaps.uprights import straightened
 from sceneslam.executors import executor
 from sceneslam.graphs.edge import Edge
 from sceneslam.scans.key_scan import KeyScan, KeyScanner
-from sceneslam.types import se3
+from sceneslam.types import planar, se3
 from sceneslam.types.errors import InputError, text_of
 from sceneslam.types.maps import MapLayers
 from sceneslam.types.observation import Observation
@@ -212,12 +212,27 @@ class Mapper:
         return self._correction(self._solved.T_map_node @ se3.inverse(old))
 
     def loops(self, stamps_ns: NDArray[np.int64]) -> list[Edge]:
-        """Return the accepted loops between rows of the path with these stamps (N,)."""
-        starts_ns = [submap.stamps_ns[0] for submap in self._collector.chain.submaps]
-        rows = np.searchsorted(stamps_ns[:-1], starts_ns).tolist()
-        row_of = [LOADED] * len(self._loaded.submaps) + rows
+        """Return the accepted loops between rows of the path with these stamps (N,).
+
+        They lead from and to the middles of submaps: what is seen along all of one places that.
+        """
+        submaps, count = self._collector.chain.submaps, len(self._loaded.submaps)
+        middles = [len(submap.stamps_ns) // 2 for submap in submaps]
+        owned = list(zip(submaps, middles, strict=True))
+        middles_ns = [submap.stamps_ns[row] for submap, row in owned]
+        rows = [LOADED] * count + np.searchsorted(stamps_ns[:-1], middles_ns).tolist()
+        T_node_middle = [se3.identity()] * count
+        T_node_middle += [planar.to_transform(submap.T_submap_base[row]) for submap, row in owned]
         return [
-            replace(loop, first=row_of[loop.first], second=row_of[loop.second])
+            replace(
+                loop,
+                first=rows[loop.first],
+                second=rows[loop.second],
+                T_first_second=se3.inverse(T_node_middle[loop.first])
+                @ loop.T_first_second
+                @ T_node_middle[loop.second],
+                covariance=se3.carried(loop.covariance, se3.inverse(T_node_middle[loop.second])),
+            )
             for loop in self._solved.loops
         ]
 
