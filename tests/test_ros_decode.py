@@ -9,7 +9,7 @@ import pytest
 from ros_recordings import STAMP_NS, Recorder
 
 from sceneslam.ros import decode, pixels
-from sceneslam.ros.clouds import cloud
+from sceneslam.ros.clouds import PointTimes, cloud
 from sceneslam.ros.encode import Encoder
 from sceneslam.sources.bag.open_recording import open_recording
 from sceneslam.types.errors import InputError
@@ -19,6 +19,7 @@ BGR = np.random.default_rng(2).integers(0, 256, (6, 8, 3), dtype=np.uint8)
 UNITS = pixels.DepthUnits(1000.0, (0.3, 8.0))
 DEPTH_MM = np.array([[0, 100, 400], [1234, 8000, 9000]], np.uint16)
 DEPTH_M = np.array([[0, 0, 0.4], [1.234, 8.0, 0]], np.float32)
+SWEEP_S = np.array([0.0, 0.05, 0.1])
 
 
 def decoded(path: Path) -> Any:
@@ -228,6 +229,32 @@ def test_points_that_are_no_numbers_are_dropped_with_their_times() -> None:
 def test_absolute_point_times_become_offsets() -> None:
     found = cloud(cloud_message(STAMP_NS * 1e-9 + np.array([0.0, 0.05, 0.1])), STAMP_NS)
     np.testing.assert_allclose(found.point_times_s, [0.0, 0.1], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("times", "kind", "expected_s"),
+    [
+        (STAMP_NS * 1e-9 + 37 + SWEEP_S, PointTimes.OTHER_CLOCK, SWEEP_S),  # PTP has TAI
+        (1000 + SWEEP_S, PointTimes.OTHER_CLOCK, SWEEP_S),  # since the sensor began
+        (1e12 + 1e9 * SWEEP_S, PointTimes.OTHER_CLOCK, SWEEP_S),
+        (STAMP_NS + 1e9 * SWEEP_S, PointTimes.GOOD, SWEEP_S),
+        (1e9 * SWEEP_S, PointTimes.GOOD, SWEEP_S),
+        (SWEEP_S - 0.1, PointTimes.GOOD, SWEEP_S - 0.1),
+        (STAMP_NS * 1e-3 + 1e6 * SWEEP_S, PointTimes.INVALID, None),
+        (1e6 * SWEEP_S, PointTimes.INVALID, None),
+        (1e3 * SWEEP_S, PointTimes.INVALID, None),
+        (np.nan * SWEEP_S, PointTimes.INVALID, None),
+    ],
+)
+def test_times_of_points_that_no_sweep_has_are_not_believed(
+    times: np.ndarray, kind: PointTimes, expected_s: np.ndarray | None
+) -> None:
+    found = cloud(cloud_message(times), STAMP_NS)
+    assert found.times is kind
+    if expected_s is None:
+        assert found.point_times_s is None
+    else:
+        np.testing.assert_allclose(found.point_times_s, expected_s[[0, 2]], atol=1e-6)
 
 
 def test_a_cloud_without_z_or_with_too_few_bytes_is_told() -> None:

@@ -482,6 +482,20 @@ def test_times_of_points_count_from_the_observation(tmp_path: Path, is_absolute:
     np.testing.assert_allclose(one.point_times_s, [-0.04, 0.01], atol=1e-6)
 
 
+@pytest.mark.parametrize(("unit", "ahead_s", "faults"), [(1.0, 37.0, 0), (1e3, 0.0, 1)])
+def test_times_of_points_that_cannot_be_are_named(
+    tmp_path: Path, unit: float, ahead_s: float, faults: int
+) -> None:
+    times = unit * (np.array([0.0, 0.05]) + ahead_s)
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        recorder.add("/points", STAMP_NS, cloud_message(STAMP_NS, times))
+    source = make_source("rosbag", tmp_path / "a.mcap")
+    (one,) = source
+    assert (one.point_times_s is None) == (faults == 1) == (len(source.faults) == 1)
+    (sentence,) = preflight(source.survey(), source.rig).warnings
+    assert sentence.startswith("/points: the times of points are")
+
+
 @pytest.mark.parametrize("late_s", [0.04, 0.0])
 def test_points_without_times_are_as_old_as_their_cloud(tmp_path: Path, late_s: float) -> None:
     stamp_ns = STAMP_NS - round(late_s * 1e9)

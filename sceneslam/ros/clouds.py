@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import Enum
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,17 @@ from sceneslam.types.errors import InputError
 
 _DTYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _TIME_NAMES = ("time", "t", "timestamp", "time_stamp", "offset_time")
-_ABSOLUTE_S = 1e6  # larger values of `time` are absolute
+_ABSOLUTE_NS = 1e15  # larger values are absolute: clocks that begin with the sensor are below
+_NS_SPAN = 1e6  # floats that span more are in ns: of 1 ms and more
+_SWEEP_MAX_S = 1.0  # no lidar turns slower, and its stamp is of a time that is as near
+
+
+class PointTimes(Enum):
+    """What the times of a cloud's points are."""
+
+    GOOD = "after the stamp, or missing"
+    OTHER_CLOCK = "of another clock than the stamp: the first point is taken to be as old as that"
+    INVALID = "spread over more than a second, and left out"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -21,6 +32,7 @@ class Cloud:
 
     points_lidar: NDArray[np.float32]  # (N, 3) [m]
     point_times_s: NDArray[np.float64] | None  # (N,) after the message's stamp
+    times: PointTimes
 
 
 def cloud(message: Any, stamp_ns: int) -> Cloud | None:
@@ -39,8 +51,14 @@ def cloud(message: Any, stamp_ns: int) -> Cloud | None:
     points = np.stack([rows[axis] for axis in "xyz"], axis=-1).astype(np.float32)
     is_good = np.isfinite(points).all(axis=1)
     name = next((name for name in _TIME_NAMES if name in (rows.dtype.names or ())), None)
-    times_s = None if name is None else _offsets_s(rows[name], stamp_ns)[is_good]
-    return Cloud(points_lidar=points[is_good], point_times_s=times_s)
+    times_s, times = None, PointTimes.GOOD
+    if name is not None and is_good.any():
+        times_s = _offsets_s(rows[name][is_good], stamp_ns)
+        times = _judged(times_s)
+    if times_s is not None and times is PointTimes.OTHER_CLOCK:
+        times_s = times_s - np.fmin.reduce(times_s)
+    kept_s = None if times is PointTimes.INVALID else times_s
+    return Cloud(points_lidar=points[is_good], point_times_s=kept_s, times=times)
 
 
 def _rows(message: Any, fields: dict[str, Any]) -> NDArray[Any] | None:
@@ -69,13 +87,21 @@ def _rows(message: Any, fields: dict[str, Any]) -> NDArray[Any] | None:
 
 
 def _offsets_s(values: NDArray[Any], stamp_ns: int) -> NDArray[np.float64]:
-    """Return times (N,) [s] after the stamp: integers are in ns, large values absolute."""
+    """Return times (N,) [s] after the stamp: integers are in ns, floats in s or ns."""
     if values.dtype.kind in "iu":
-        if values.dtype.itemsize < 8 or not len(values) or int(values.max()) < 10**15:
-            return values.astype(np.float64) * 1e-9
-        return (values.astype(np.int64) - stamp_ns).astype(np.float64) * 1e-9
+        is_absolute = int(values.max()) > _ABSOLUTE_NS
+        return (values.astype(np.int64) - is_absolute * stamp_ns).astype(np.float64) * 1e-9
     times = values.astype(np.float64)
-    largest = float(np.nanmax(times)) if len(times) else 0.0
-    if largest > _ABSOLUTE_S * 1e9:
-        return (times - stamp_ns) * 1e-9
-    return times - stamp_ns * 1e-9 if largest > _ABSOLUTE_S else times
+    largest = float(np.fmax.reduce(times))
+    if largest - float(np.fmin.reduce(times)) > _NS_SPAN:
+        return (times - (largest > _ABSOLUTE_NS) * stamp_ns) * 1e-9
+    return times - (largest * 1e9 > _ABSOLUTE_NS) * stamp_ns * 1e-9
+
+
+def _judged(times_s: NDArray[np.float64]) -> PointTimes:
+    """Tell what times (N,) [s] after the stamp can be, by how long a sweep lasts."""
+    first_s, last_s = float(np.fmin.reduce(times_s)), float(np.fmax.reduce(times_s))
+    if not last_s - first_s < _SWEEP_MAX_S:  # also if all are NaN
+        return PointTimes.INVALID
+    is_near = first_s < _SWEEP_MAX_S and last_s > -_SWEEP_MAX_S
+    return PointTimes.GOOD if is_near else PointTimes.OTHER_CLOCK

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.ros import decode
-from sceneslam.ros.clouds import Cloud, cloud
+from sceneslam.ros.clouds import Cloud, PointTimes, cloud
 from sceneslam.ros.pixels import DepthUnits, locked
 from sceneslam.sources.bag.synchronise import Sample, SynchronisedSamples
 from sceneslam.types.errors import InputError
@@ -148,12 +148,14 @@ class BundleDecoder:
         if found is None:
             problems.append("a point cloud is shorter than it says")
             return None
+        if found.times is PointTimes.INVALID:
+            problems.append(f"the times of a cloud's points are {found.times.value}")
         times_s, late_s = found.point_times_s, (sample.stamp_ns - bundle.primary.stamp_ns) * 1e-9
         if times_s is None and late_s != 0.0:
             times_s = np.zeros(len(found.points_lidar))
         if times_s is not None:
             times_s = locked(times_s + late_s)
-        return Cloud(points_lidar=locked(found.points_lidar), point_times_s=times_s)
+        return replace(found, points_lidar=locked(found.points_lidar), point_times_s=times_s)
 
     def _odometry(self, bundle: SynchronisedSamples) -> NDArray[np.float64] | None:
         is_primary = self._primary is Sensor.ODOMETRY

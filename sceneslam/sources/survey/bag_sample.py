@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from sceneslam.ros import decode
-from sceneslam.ros.clouds import cloud
+from sceneslam.ros.clouds import PointTimes, cloud
 from sceneslam.ros.pixels import DepthUnits
 from sceneslam.sources.bag.observation import Mounts, measured
 from sceneslam.sources.bag.recording import Message, Recording
@@ -77,7 +77,14 @@ def survey_recording(
         gyro_radps=samples.gyro_radps,
         unplaced=unplaced,
         silent=silent,
-        odd=odd,
+        odd=[
+            *odd,
+            *(
+                f"{topics[Sensor.POINTS]}: the times of points are {one.value}"
+                for one in PointTimes
+                if one is not PointTimes.GOOD and one in samples.point_times
+            ),
+        ],
     )
 
 
@@ -119,6 +126,7 @@ class _Samples:
         self.depths_m: list[Any] = []
         self.scans: list[Any] = []
         self.clouds: list[Any] = []
+        self.point_times: set[PointTimes] = set()
         self.odometry_ns: list[int] = []
         self.T_odom_base: list[Any] = []
         self.gyro_radps: list[Any] = []
@@ -165,3 +173,4 @@ class _Samples:
         elif sensor is Sensor.POINTS:
             found = cloud(value, stamp_ns)
             self.clouds += [] if found is None else [found.points_lidar]
+            self.point_times |= set() if found is None else {found.times}
