@@ -132,6 +132,18 @@ def test_compressed_depth_of_both_kinds_is_read(tmp_path: Path) -> None:
         np.testing.assert_array_equal(decode.depth_m(message, UNITS), DEPTH_M)
 
 
+@pytest.mark.parametrize("encoding", ["mono16", "mono16; png compressed "])
+def test_16_bit_grey_is_depth_only_where_its_topic_says_so(tmp_path: Path, encoding: str) -> None:
+    """A thermal camera has the same encoding."""
+    grey = np.full((2, 3), 90 << 8, np.uint16)
+    png = cv2.imencode(".png", grey)[1].tobytes()
+    is_raw = encoding == "mono16"
+    message = image(tmp_path, grey, encoding) if is_raw else compressed(tmp_path, png, encoding)
+    assert not decode.is_depth(message, "/thermal/image_raw")
+    assert decode.is_depth(message, "/depth/image_raw")
+    assert (decode.image_bgr(message) == 90).all()
+
+
 def test_inverse_depth_is_turned_round(tmp_path: Path) -> None:
     scale, offset = 10000.0, -5.0
     metres = np.array([[1.0, 2.0, 4.0]])

@@ -75,12 +75,12 @@ def is_depth(message: Any, topic: str) -> bool:
     kind = encoding.split(";")[0].strip()
     if kind in ("16UC1", "32FC1"):
         return True
-    if kind in _COLOR and kind != "mono16":
+    if kind == "mono16":  # also of thermal cameras
+        return "depth" in topic.lower()
+    if kind in _COLOR or not is_compressed or "jp" in encoding:
         return False
-    if is_compressed and "jp" not in encoding:
-        stored = pixels.decode(message.data.tobytes(), cv2.IMREAD_UNCHANGED)
-        return stored is not None and stored.dtype == np.uint16 and stored.ndim == 2
-    return kind == "mono16" and "depth" in topic.lower()
+    stored = pixels.decode(message.data.tobytes(), cv2.IMREAD_UNCHANGED)
+    return stored is not None and stored.dtype == np.uint16 and stored.ndim == 2
 
 
 def is_grey(message: Any) -> bool:
