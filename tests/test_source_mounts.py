@@ -213,6 +213,23 @@ def test_imu_of_a_camera_without_a_robot_has_the_cameras_axes(
     assert source.survey().unplaced == unplaced
 
 
+@pytest.mark.parametrize(
+    ("frame", "T_base_lidar"),
+    [("camera_depth_optical_frame", optical_to_rep103()), ("lidar", np.eye(4))],
+)
+def test_points_of_an_optical_frame_without_transforms_look_ahead(
+    tmp_path: Path, frame: str, T_base_lidar: np.ndarray
+) -> None:
+    data = Encoder().points(STAMP_NS, np.ones((2, 3), np.float32), None)
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    message = store.deserialize_cdr(data, "sensor_msgs/msg/PointCloud2")
+    message.header.frame_id = frame
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        recorder.add("/points", STAMP_NS, message)
+    source = make_source("mcap", tmp_path / "a.mcap")
+    np.testing.assert_array_equal(source.rig.lidar.T_base_lidar, T_base_lidar)
+
+
 def test_gyro_and_accelerometer_may_come_in_messages_of_their_own(tmp_path: Path) -> None:
     store = get_typestore(Stores.ROS2_HUMBLE)
     samples = {

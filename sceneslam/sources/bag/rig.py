@@ -78,10 +78,10 @@ def make_rig(recording: Recording, topics: BagTopics, frames: FrameTree, given: 
 
 
 def place(recording: Recording, topic: str, frames: FrameTree) -> Transform:
-    """Return T_base_sensor (4, 4) [m] of a topic's sensor; identity if it is not recorded."""
+    """Return T_base_sensor (4, 4) [m] of a topic's sensor; if it is not recorded, the usual one."""
     message = first(recording, topic)
     T_base_sensor = None if message is None else frames.T_base(decode.frame_id(message))
-    return se3.identity() if T_base_sensor is None else T_base_sensor
+    return _usual(message) if T_base_sensor is None else T_base_sensor
 
 
 def unplaced(recording: Recording, topics: BagTopics, frames: FrameTree) -> list[str]:
@@ -123,15 +123,10 @@ def unregistered(recording: Recording, topics: BagTopics, frames: FrameTree) -> 
 
 
 def find_mounts(recording: Recording, topics: BagTopics, frames: FrameTree) -> Mounts:
-    """Return the poses of the IMU and of odometry's frame; identity where they are not recorded.
-
-    An optical frame of unknown pose looks along x, as a camera does.
-    """
+    """Return the poses of the IMU and of odometry's frame; the usual ones if not recorded."""
     T_base_imu = _T_base_imu(recording, topics, frames)
     if T_base_imu is None:
-        imu = first(recording, topics.imu) if topics.imu else None
-        is_optical = imu is not None and decode.frame_id(imu).endswith("_optical_frame")
-        T_base_imu = optical_to_rep103() if is_optical else se3.identity()
+        T_base_imu = _usual(first(recording, topics.imu) if topics.imu else None)
     child = _odometry_child(recording, topics)
     T_base_child = frames.T_base(child) if child else None
     T_child_base = se3.identity() if T_base_child is None else se3.inverse(T_base_child)
@@ -153,6 +148,15 @@ def picture_size_wh(recording: Recording, topics: BagTopics) -> tuple[int, int]:
     raise InputError(f"none of the images of {topic} can be decoded")
 
 
+def _usual(message: Any) -> Transform:
+    """Return T_base_sensor (4, 4) [m] of a message's sensor that no transform places: identity.
+
+    In an optical frame it looks along x, as a camera does.
+    """
+    is_optical = message is not None and decode.frame_id(message).endswith("_optical_frame")
+    return optical_to_rep103() if is_optical else se3.identity()
+
+
 def _odometry_child(recording: Recording, topics: BagTopics) -> str:
     """Return the frame whose pose odometry reports, "" if it is not named."""
     message = first(recording, topics.odometry) if topics.odometry else None
@@ -169,13 +173,11 @@ def _T_base_imu(recording: Recording, topics: BagTopics, frames: FrameTree) -> T
         return None
     frame = decode.frame_id(imu)
     T_base_imu = frames.T_base(frame)
-    for topic, T_base_sensor in (
-        (topics.points, se3.identity()),
-        (topics.scan, se3.identity()),
-        (topics.image or topics.depth, optical_to_rep103()),
-    ):
+    picture = topics.image or topics.depth
+    for topic in (topics.points, topics.scan, picture):
         sensor = first(recording, topic) if topic and T_base_imu is None else None
         if sensor is not None and decode.frame_id(sensor) != frame:
+            T_base_sensor = optical_to_rep103() if topic == picture else _usual(sensor)
             T_sensor_imu = frames.between(decode.frame_id(sensor), frame)
             T_base_imu = None if T_sensor_imu is None else T_base_sensor @ T_sensor_imu
     return T_base_imu
