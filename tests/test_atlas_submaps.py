@@ -150,6 +150,16 @@ def test_a_submap_ends_after_its_length_its_turn_and_its_session():
     assert third.stamps_ns[0] == 11 * S
 
 
+@pytest.mark.parametrize("pitch_rad", [0.0, 0.3])
+def test_a_submap_is_level_in_the_plane_however_its_first_pose_is_tilted(pitch_rad):
+    begun = at(1.0, 2.0, 0.5)
+    tilted = begun @ pitched(0.0, pitch_rad=pitch_rad)
+    poses = [tilted, *(begun @ at(0.2 * k, 0.1, 0.3) for k in range(1, 10))]
+    own = make_submap([key_pose(k, T) for k, T in enumerate(poses)], 0, se3.identity())
+    due = [[0.2 * k, 0.1, 0.3] for k in range(1, 10)]
+    np.testing.assert_allclose(own.T_submap_base, [[0.0, 0.0, 0.0], *due], atol=1e-9)
+
+
 def test_a_climb_is_as_long_as_a_way_ahead():
     def up(z_m):
         T = se3.identity()

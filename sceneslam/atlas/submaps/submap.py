@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from sceneslam.atlas.places.floor_plan import FloorPlan, draw
 from sceneslam.atlas.uncertainty import Covariance, Drift, motions
+from sceneslam.motion.tilt import upright
 from sceneslam.scans.key_scan import KeyScan
 from sceneslam.types import planar, se3
 from sceneslam.types.covariance import grown
@@ -21,6 +22,7 @@ from sceneslam.views.view import Landmarks, LandmarkView, PlacedView
 LENGTH_M = 2.5  # length of path in a submap: by MAPPED it drifts 1 cm
 TURN_RAD = 2 * np.pi  # or this much turning, after which everything around was seen
 STEP_M, STEP_RAD = 0.1, 0.1  # between two scans of a submap
+_UP = np.array([0.0, 0.0, 1.0])
 LEAST = np.repeat([0.003, 0.002], 3)  # m, rad: least standard deviations between two submaps
 
 
@@ -62,13 +64,16 @@ class Drawing:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Submap:
-    """A node of the graph. Its frame is base at its first pose; the plan lies level in it."""
+    """A node of the graph. Its frame is base at its first pose.
+
+    What is planar is in that pose without its roll and pitch in the run, as `planar` places it.
+    """
 
     run: int  # index of the run, by age, in a saved map
     session: int
     module: str
     stamps_ns: NDArray[np.int64]  # (K,) of its poses
-    T_submap_base: NDArray[np.float64]  # (K, 3)
+    T_submap_base: NDArray[np.float64]  # (K, 3), planar
     drawing: Drawing  # of its plan
     views: tuple[PlacedView, ...] = ()
     up: NDArray[np.float64] | None = None  # (3,), the vertical direction, if it was measured
@@ -82,7 +87,8 @@ class Submap:
 def make_submap(poses: Sequence[KeyPose], run: int, T_base_cam: Transform) -> Submap:
     """Return the submap of consecutive poses of one session, and what a camera saw there."""
     first = poses[0]
-    T_submap_base = [_planar(first, pose) for pose in poses]
+    T_level_map = se3.inverse(upright(first.T_map_base, _UP))
+    T_submap_base = [planar.from_transform(T_level_map @ pose.T_map_base) for pose in poses]
     placed = zip(T_submap_base, (pose.scan for pose in poses), strict=True)
     return Submap(
         run=run,
@@ -164,8 +170,3 @@ def _grown(poses: Sequence[KeyPose]) -> Covariance:
 def _moved(poses: Sequence[KeyPose]) -> NDArray[np.float64]:
     """Return the length and the angle (K - 1, 2) [m, rad] of the motions between K poses."""
     return motions(np.array([pose.T_map_base for pose in poses]))
-
-
-def _planar(first: KeyPose, second: KeyPose) -> Planar:
-    """Return the planar part of the motion from one pose to another."""
-    return planar.from_transform(se3.inverse(first.T_map_base) @ second.T_map_base)
