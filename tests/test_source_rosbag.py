@@ -1,5 +1,6 @@
 """Recordings of others: topics, intrinsics, frames, truth."""
 
+import gc
 from pathlib import Path
 from typing import Any
 
@@ -64,7 +65,7 @@ def test_all_storages_give_the_same_scans(shared_data: Path, name: str) -> None:
 @pytest.mark.parametrize("mode", [CompressionMode.MESSAGE, CompressionMode.FILE])
 @pytest.mark.parametrize("storage", list(StoragePlugin))
 def test_recordings_of_every_compression_are_read(
-    tmp_path: Path, mode: CompressionMode, storage: StoragePlugin
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: CompressionMode, storage: StoragePlugin
 ) -> None:
     store = get_typestore(Stores.ROS2_HUMBLE)
     writer = Writer(tmp_path / "bag", version=9, storage_plugin=storage)
@@ -75,9 +76,17 @@ def test_recordings_of_every_compression_are_read(
         for number in range(5):
             stamp_ns = STAMP_NS + number * 10**8
             writer.write(odom, stamp_ns, Encoder().odometry(stamp_ns, pose, "odom"))
-    found = list(make_source("rosbag", tmp_path / "bag"))
-    assert len(found) == 5
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    source = make_source("rosbag", tmp_path / "bag")
+    unpacked = {path.stat().st_ino for path in tmp_path.glob("tmp*")}
+    assert len(unpacked) == (mode is CompressionMode.FILE)
+    found = list(source)
+    assert len(found) == source.length == 5 and source.span.start_ns == STAMP_NS
     np.testing.assert_allclose(found[0].T_odom_base, pose)
+    assert {path.stat().st_ino for path in tmp_path.glob("tmp*")} == unpacked
+    del source
+    gc.collect()
+    assert not list(tmp_path.glob("tmp*"))
 
 
 def test_points_come_before_scans_and_truth_is_no_odometry(shared_data: Path) -> None:

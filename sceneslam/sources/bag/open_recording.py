@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
+import weakref
 from collections import deque
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -64,10 +65,19 @@ def _packs_messages(metadata: Path) -> bool:
 
 
 class FolderRecording:
-    """A rosbag2 folder with sqlite3 storage (or compressed files or messages)."""
+    """A rosbag2 folder with sqlite3 storage (or compressed files or messages).
+
+    It is open as long as this object lives, since a compressed file is unpacked when it is opened.
+    """
 
     def __init__(self, path: Path) -> None:
+        from rosbags.rosbag2 import Reader
+
         self._path = path
+        with self._guarded():
+            self._reader = Reader(path)
+            self._reader.open()
+        weakref.finalize(self, self._reader.close)
         self.faults: Sequence[str] = ()
         self.is_slow = False
         self.metadata: Mapping[str, Mapping[str, str]] = {}
@@ -76,20 +86,17 @@ class FolderRecording:
 
     def messages(self, topics: Collection[str], from_ns: int | None = None) -> Iterator[Message]:
         """Yield the messages of `topics` by log time."""
-        from rosbags.rosbag2 import Reader
-
-        with self._guarded(), Reader(self._path) as reader:
-            wanted = [entry for entry in reader.connections if entry.topic in topics]
+        reader = self._reader
+        wanted = [entry for entry in reader.connections if entry.topic in topics]
+        with self._guarded():
             for entry, log_ns, data in reader.messages(wanted, start=from_ns) if wanted else ():
                 yield Message(topic=entry.topic, log_ns=log_ns, data=bytes(data))
 
     def last(self, topic: str) -> Message | None:
         """Return the topic's last message; searches increasing time spans before the end."""
-        from rosbags.rosbag2 import Reader
-
-        with self._guarded(), Reader(self._path) as reader:
-            wanted = [entry for entry in reader.connections if entry.topic == topic]
-            back_ns = _FIRST_LOOK_BACK_NS
+        reader, back_ns = self._reader, _FIRST_LOOK_BACK_NS
+        wanted = [entry for entry in reader.connections if entry.topic == topic]
+        with self._guarded():
             while True:
                 start_ns = max(reader.start_time, reader.end_time - back_ns)
                 found = deque(reader.messages(wanted, start=start_ns), maxlen=1)
@@ -105,22 +112,19 @@ class FolderRecording:
         return self._decoder.decode(message.topic, message.data)
 
     def _read_topics(self) -> dict[str, TopicType]:
-        from rosbags.rosbag2 import Reader
-
         topics: dict[str, TopicType] = {}
-        with self._guarded(), Reader(self._path) as reader:
-            for entry in reader.connections:
-                if not entry.msgcount:
-                    continue
-                known = topics.get(entry.topic)
-                is_idl = entry.msgdef.format.name == "IDL"
-                topics[entry.topic] = TopicType(
-                    msgtype=entry.msgtype,
-                    encoding="cdr",
-                    definition=entry.msgdef.data,
-                    definition_format="ros2idl" if is_idl else "ros2msg",
-                    count=entry.msgcount + (known.count if known else 0),
-                )
+        for entry in self._reader.connections:
+            if not entry.msgcount:
+                continue
+            known = topics.get(entry.topic)
+            is_idl = entry.msgdef.format.name == "IDL"
+            topics[entry.topic] = TopicType(
+                msgtype=entry.msgtype,
+                encoding="cdr",
+                definition=entry.msgdef.data,
+                definition_format="ros2idl" if is_idl else "ros2msg",
+                count=entry.msgcount + (known.count if known else 0),
+            )
         return topics
 
     @contextmanager
