@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from ros_recordings import STAMP_NS, Recorder, make_source
+from rosbags.rosbag1 import Writer as BagWriter
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
@@ -60,6 +61,27 @@ def test_all_storages_give_the_same_scans(shared_data: Path, name: str) -> None:
     assert source.rig.sensors == {Sensor.SCAN}
     assert np.isnan(found[0].scan.ranges_m[16])
     assert source.ground_truth() is None
+
+
+def test_a_split_bag_is_read_as_one(tmp_path: Path) -> None:
+    """Parts as `rosbag record --split` names them."""
+    store = get_typestore(Stores.ROS1_NOETIC)
+    names = ("builtin_interfaces/msg/Time", "std_msgs/msg/Header", "sensor_msgs/msg/LaserScan")
+    Time, Header, LaserScan = (store.types[name] for name in names)
+    for part in (10, 9):
+        with BagWriter(tmp_path / f"drive_{part}.bag") as writer:
+            topic = writer.add_connection("/scan", LaserScan.__msgtype__, typestore=store)
+            for number in range(3 * part, 3 * part + 3):
+                stamp = Time(sec=STAMP_NS // 10**9 + number, nanosec=STAMP_NS % 10**9)
+                limits = (-1.0, 1.0, 0.1, 0.0, 0.0, 0.1, 10.0)
+                ranges = (np.ones(21, np.float32), np.zeros(0, np.float32))
+                scan = LaserScan(Header(seq=0, stamp=stamp, frame_id="laser"), *limits, *ranges)
+                data = store.serialize_ros1(scan, LaserScan.__msgtype__)
+                writer.write(topic, STAMP_NS + number * 10**9, data)
+    source = make_source("rosbag", tmp_path)
+    stamps_ns = [STAMP_NS + number * 10**9 for number in range(27, 33)]
+    assert [one.stamp_ns for one in source] == stamps_ns
+    assert source.length == 6 and source.faults == []
 
 
 @pytest.mark.parametrize("mode", [CompressionMode.MESSAGE, CompressionMode.FILE])

@@ -1,4 +1,4 @@
-"""Opening of recordings: ROS 1 bags, rosbag2 folders (MCAP, sqlite3) and bare MCAP files."""
+"""Opening of recordings: ROS 1 bags, rosbag2 folders (MCAP, sqlite3), MCAP files; also split."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sceneslam.ros.messages import MessageDecoder, TopicType
 from sceneslam.sources.bag import mcap_records, ros1_records
 from sceneslam.sources.bag.mcap_file import open_mcap
 from sceneslam.sources.bag.recording import Message, Recording
-from sceneslam.sources.bag.ros1_file import open_bag
+from sceneslam.sources.bag.ros1_file import open_bags
 from sceneslam.types.errors import InputError, text_of
 from sceneslam.types.input_files import check_regular, files_by_number
 
@@ -37,7 +37,7 @@ def open_recording(path: Path) -> Recording:
     if not start:
         raise InputError(f"recording: the file is empty: {path}")
     if start.startswith(ros1_records.MAGIC):
-        return open_bag(path)
+        return open_bags([path])
     if start.startswith(mcap_records.MAGIC):
         return open_mcap([path])
     if start.startswith(b"SQLite format 3"):
@@ -53,8 +53,13 @@ def _open_folder(path: Path) -> Recording:
     if not metadata.is_file() and files_by_number(path, {".db3"}):
         how = f"ros2 bag reindex {shlex.quote(str(path))} -s sqlite3"
         raise InputError(f"recording: its metadata.yaml is missing; write it by `{how}`: {path}")
+    bags = files_by_number(path, {".bag"})
+    if not metadata.is_file() and bags:
+        return open_bags(bags)
     if not metadata.is_file():
-        raise InputError(f"recording: the folder has neither metadata.yaml nor *.mcap: {path}")
+        raise InputError(
+            f"recording: the folder has neither metadata.yaml nor *.mcap nor *.bag: {path}"
+        )
     return FolderRecording(path)
 
 

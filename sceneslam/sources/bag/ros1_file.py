@@ -21,10 +21,12 @@ from sceneslam.sources.bag.ros1_survey import BagSurvey
 from sceneslam.types.errors import InputError
 
 
-def open_bag(path: Path) -> ChunkedRecording:
-    """Return the recording of a file; raises InputError unless it is a ROS 1 bag."""
-    bag = BagFile(path)
-    return ChunkedRecording([bag.layout()], bag.read, is_slow=bag.is_slow)
+def open_bags(paths: Sequence[Path]) -> ChunkedRecording:
+    """Return one recording of all files; raises InputError unless all are ROS 1 bags."""
+    bags = {path: BagFile(path) for path in paths}
+    layouts = [bag.layout() for bag in bags.values()]
+    is_slow = any(bag.is_slow for bag in bags.values())
+    return ChunkedRecording(layouts, lambda chunk: bags[chunk.file].read(chunk), is_slow=is_slow)
 
 
 class BagFile:
