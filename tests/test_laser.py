@@ -150,20 +150,24 @@ def test_sweep_that_comes_after_newer_observations_is_matched_where_it_was_made(
     assert off_m.max() < 0.012
 
 
-def test_scan_whose_sweep_ends_after_the_observation_is_matched_where_it_was_made():
-    """A message has the stamp of its first beam; the middle of the sweep is 33 ms later."""
+@pytest.mark.parametrize("has_wheels", [True, False])
+@pytest.mark.parametrize("late", [1, -1])
+def test_scan_beside_its_observation_is_matched_where_it_was_made(late, has_wheels):
+    """A message has the stamp of its first beam; the middle of its sweep is 33 ms later."""
     path = loop_path(480)
-    fine = np.vstack([np.tile(path[:1], (9, 1)), path])  # it stands until the map has begun
-    observations = drive(room(), fine, odometry=fine, rng=np.random.default_rng(5))
+    odometry = path if has_wheels else None
+    observations = drive(room(), path, odometry=odometry, rng=np.random.default_rng(5))
     given = []
-    for index in range(0, 486, 3):
+    for index in range(3, 477, 3):  # it drives when the map begins
         stamp_ns = index * 33_000_000
-        scan = replace(observations[index + 1].scan, stamp_ns=stamp_ns + 33_000_000)
+        scan = observations[index + late].scan
+        scan = replace(scan, stamp_ns=stamp_ns + late * 33_000_000)
         given.append(replace(observations[index], stamp_ns=stamp_ns, scan=scan))
-    module = active()
-    off = errors(fine[0:486:3], [module.track(observation) for observation in given])
-    assert off[:, 0].max() < 0.012
-    assert off[:, 1].mean() < 0.002  # 0.013, if they were matched as of the stamps
+    rig = LASER_RIG if has_wheels else replace(LASER_RIG, sensors=frozenset({Sensor.SCAN}))
+    module = active(rig)
+    off = errors(path[3:477:3], [module.track(observation) for observation in given])
+    assert off[:, 0].max() < 0.008
+    assert off[:, 1].mean() < 0.003  # 0.02, if the first scan is as of its observation
 
 
 def test_slow_sweep_beside_a_fast_camera_is_matched_where_it_was_made():

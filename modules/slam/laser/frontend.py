@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,6 +73,7 @@ class FrontEnd:
     _field: LikelihoodField | None = field(default=None, init=False)
     _doubt: Doubt = field(default_factory=Doubt, init=False)
     _trail: Trail = field(default_factory=Trail, init=False)
+    _late_s: float = field(default=0.0, init=False)  # of the first scan, until its pose is known
 
     def track(self, observation: Observation, scan: LaserScan | None) -> Tracking:
         """Return the pose at the observation, corrected by its scan if it has one."""
@@ -89,6 +90,10 @@ class FrontEnd:
             then_ns = scan.stamp_ns if before_ns is None else min(scan.stamp_ns, before_ns)
             begin = compose(before, from_transform(self._trail.base_at(then_ns)))
         self._trail.move(observation.stamp_ns, motion.T_prev_curr)
+        duration_s = self.motion.duration_s
+        if self._late_s != 0.0 and before_ns == self._held_ns and duration_s > 0.0:
+            T_prev_first = self._late_s / duration_s * T_prev_curr
+            self._move_first(compose(before, T_prev_first), is_known=motion.is_measured)
         if scan is None or surfaces is None:
             return self._predict(observation, predicted, motion)
         # The scan is older than the observation, or a sweep from it on: match at the pose then.
@@ -97,6 +102,8 @@ class FrontEnd:
         T_then_now = between(predicted_then, predicted)
         if self._field is None:
             self._extend(predicted_then, scan, surfaces)
+            if before_ns is None or not motion.is_measured:
+                self._late_s = _late_s(scan, observation)
             return self._hold(observation, predicted, None)
         is_first = self._fit_ns is None
         if self.matcher.misfit == 0.0 or is_first:
@@ -124,6 +131,8 @@ class FrontEnd:
                 match = again
         if not self._believes(match):
             return self._distrust(predicted, predicted_then, motion, match, scan, surfaces)
+        if self._late_s != 0.0:
+            match, T_then_now = self._with_first(match, scan, observation)
         if self._is_lost or (is_known and not match.weighs_sources):
             self.motion.skip()  # a jump, also where the wheels missed it, tells no velocity
             self.motion.inertia.reset()
@@ -285,8 +294,35 @@ class FrontEnd:
         G = turn(-float(self._pose[2]))
         return spatial_covariance(G @ covariance @ G.T, level)
 
+    def _move_first(self, T_local_base: Planar, *, is_known: bool) -> None:
+        """Move the first keyframe, while it is the only one, to the pose at its scan."""
+        (first,), late_s = self.keyframes.frames, self._late_s
+        self.keyframes.clear()
+        self._extend(T_local_base, first.scan, self.reader.read(first.scan))
+        self._late_s = 0.0 if is_known else late_s
+
+    def _with_first(
+        self, match: Match, scan: LaserScan, observation: Observation
+    ) -> tuple[Match, Planar]:
+        """Return the first match as it is after the first keyframe moves with it, and T_then_now.
+
+        Nothing but this match tells the velocity within the first sweep.
+        """
+        (first,) = self.keyframes.frames
+        since_s = max((scan.stamp_ns - first.scan.stamp_ns) * 1e-9, abs(self._late_s))
+        velocity_s = between(first.T_local_base, match.T_local_base) / since_s
+        T_local_first = compose(self._held_pose, self._late_s * velocity_s)
+        self._move_first(T_local_first, is_known=True)
+        pose, alone = (
+            compose(T_local_first, between(first.T_local_base, T_local_then))
+            for T_local_then in (match.T_local_base, match.T_local_alone)
+        )
+        moved = replace(match, T_local_base=pose, T_local_alone=alone)
+        return moved, -_late_s(scan, observation) * velocity_s
+
     def _extend(self, T_local_base: Planar, scan: LaserScan, surfaces: SurfacePoints) -> None:
         """Make the scan a keyframe."""
+        self._late_s = 0.0
         self.keyframes.add(ScanKeyframe(T_local_base=T_local_base, scan=scan), surfaces)
         self._field = LikelihoodField(
             self.keyframes.latest(),
@@ -299,6 +335,12 @@ def _is_better(match: Match, other: Match) -> bool:
     """Tell whether a match is another pose than the other, and more of the scan fits there."""
     is_other = is_apart(difference(match.T_local_base, other.T_local_base))
     return is_other and match.inliers > other.inliers
+
+
+def _late_s(scan: LaserScan, observation: Observation) -> float:
+    """Return how much later a scan is than its observation, at most half of the slowest sweep."""
+    late_s = (scan.stamp_ns - observation.stamp_ns) * 1e-9
+    return min(max(late_s, -SWEEP_MAX_S / 2), SWEEP_MAX_S / 2)
 
 
 def _share(stamp_ns: int, before_ns: int | None, now_ns: int) -> float:

@@ -54,6 +54,11 @@ class ScanKeyframes:
         self.frames.append(frame)
         self._surfaces.append(surfaces_base.moved(frame.T_local_base))
 
+    def clear(self) -> None:
+        """Remove all keyframes."""
+        self.frames.clear()
+        self._surfaces.clear()
+
     def free(self, T_base_laser: Transform, range_max_m: float) -> FreeSpace:
         """Return the free space of the latest two submaps."""
         recent = self.frames[-len(self._surfaces) :]
