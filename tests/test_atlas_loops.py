@@ -1,8 +1,12 @@
 """Which submaps' plans are compared to close a loop, with what, and where."""
 
+from dataclasses import replace
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from planar_poses import transforms
+from test_atlas_maps import edge
 from test_atlas_places import CELL, plan_of, quality
 
 from sceneslam.atlas.lasting.saved_map import empty_map
@@ -14,7 +18,7 @@ from sceneslam.atlas.submaps.plan_loops import PlanLoops
 from sceneslam.atlas.submaps.run_graph import RunGraph
 from sceneslam.atlas.submaps.submap import Drawing, Submap
 from sceneslam.graphs.edge import EdgeKind
-from sceneslam.types import planar
+from sceneslam.types import planar, se3
 
 WALL = plan_of("##")
 EMPTY = join([])
@@ -199,3 +203,23 @@ def test_a_target_is_made_once_for_all_that_are_compared_with_it(monkeypatch):
         finder.forget(count)
         assert len(finder.loops_to(query_of(19, submaps, nodes, drift))) == 2
         assert len(compared.targets) == made
+
+
+@pytest.mark.parametrize(("tilt_rad", "is_on_floor"), [(0.0, True), (0.15, False)])
+def test_a_loop_by_plans_has_the_tilt_of_a_sensor_that_is_carried_by_hand(tilt_rad, is_on_floor):
+    rng, count = np.random.default_rng(0), 12
+    flat = transforms([[2.0 * np.cos(k), 2.0 * np.sin(k), k] for k in range(count)])
+    tilts = tilt_rad * rng.uniform(-1.0, 1.0, (count, 6)) * [0.0, 0.0, 0.3, 1.0, 1.0, 0.0]
+    nodes = [T @ se3.exp(tilt) for T, tilt in zip(flat, tilts, strict=True)]
+    steps = [se3.inverse(a) @ b for a, b in pairwise(nodes)]
+    motions = [replace(edge(k, k + 1), T_first_second=step) for k, step in enumerate(steps)]
+    chain = Chain(
+        submaps=[submap(0)] * count,
+        T_run_node=nodes,
+        motions=motions,
+        drift=[np.zeros((2, 3))] * count,
+    )
+    query = LoopQuery.of(chain, count - 1)
+    found = query.on_plane(2, planar.between(query.plane[2], query.plane[-1]))
+    assert query.is_on_floor == is_on_floor
+    np.testing.assert_allclose(found, se3.inverse(nodes[2]) @ nodes[-1], atol=1e-9)

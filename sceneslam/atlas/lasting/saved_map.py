@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from sceneslam.atlas.places.floor_plan import FloorPlan, check_size, join
 from sceneslam.atlas.submaps.graph import connected, fits
 from sceneslam.atlas.submaps.submap import Drawing, Submap
-from sceneslam.atlas.submaps.uprights import are_on_floor, are_steady
+from sceneslam.atlas.submaps.uprights import are_on_floor, are_steady, usual_up
 from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.motion.tilt import upright
 from sceneslam.types import planar, se3
 from sceneslam.types.maps import PoseGraphLayer
 from sceneslam.types.planar import Planar
-from sceneslam.types.se3 import Transform, Vector
+from sceneslam.types.se3 import Transform
 from sceneslam.views.placed_views import are_covered
 from sceneslam.views.view import Landmarks
 
@@ -154,10 +154,9 @@ class SavedMap:
         if not are_steady(nodes, *ups_base):
             askew = se3.identity()
         T_map_floor = self.T_map_node[self.nearest(T_map_base, piece)] @ se3.inverse(askew)
-        up_map = self._up(own, askew[2, :3])
-        motions = [edge for edge in self.edges if edge.kind is EdgeKind.MOTION]
-        motions = [edge for edge in motions if self.pieces[edge.first] == piece]
-        if not are_on_floor(motions, self.T_map_node, askew[2, :3], up_map):
+        up_map = usual_up([self.submaps[node] for node in own], nodes, askew[2, :3])
+        edges = [edge for edge in self.edges if self.pieces[edge.first] == piece]
+        if not are_on_floor(edges, self.T_map_node, askew[2, :3], up_map):
             level = upright(se3.identity(), up_map)
             T_map_floor = se3.inverse(level) @ upright(level @ T_map_floor, _UP)
             askew = se3.identity()
@@ -166,12 +165,6 @@ class SavedMap:
         stood = T_map_floor @ planar.to_transform(planar.between(floor, base)) @ askew
         stood[:2, 3] = T_map_base[:2, 3]
         return np.asarray(stood)
-
-    def _up(self, nodes: Sequence[int], up_node: Vector) -> Vector:
-        """Return the usual vertical direction (3,) in the map; `up_node` if none was measured."""
-        ups = [up_node if (up := self.submaps[node].up) is None else up for node in nodes]
-        mean = np.median(np.einsum("nij,nj->ni", self.T_map_node[nodes, :3, :3], ups), axis=0)
-        return np.asarray(mean / np.linalg.norm(mean))
 
     def graph(self) -> PoseGraphLayer:
         """Return nodes and edges as a layer."""

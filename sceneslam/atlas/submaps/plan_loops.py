@@ -46,7 +46,7 @@ class PlanLoops:
                 Edge(
                     first=first,
                     second=query.second,
-                    T_first_second=planar.to_transform(match.T_target_query),
+                    T_first_second=query.on_plane(first, match.T_target_query),
                     covariance=on_floor(match.covariance),
                     kind=EdgeKind.LOOP,
                 )

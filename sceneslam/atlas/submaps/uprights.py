@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sceneslam.atlas.submaps.chain import Chain
 from sceneslam.atlas.submaps.graph import UPRIGHT_RAD, Upright
 from sceneslam.atlas.submaps.submap import Submap
-from sceneslam.graphs.edge import Edge
+from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.motion.tilt import upright
 from sceneslam.types import se3
 from sceneslam.types.se3 import Vector
@@ -50,14 +50,22 @@ def are_steady(
     return bool((changes**2).sum() <= (least**2).sum() + UPRIGHT_RAD**2)
 
 
+def usual_up(submaps: Sequence[Submap], T_map_node: NDArray[np.float64], up_node: Vector) -> Vector:
+    """Return the usual vertical direction (3,) in the map; `up_node` (3,) if none was measured."""
+    ups = [up_node if submap.up is None else submap.up for submap in submaps]
+    up = np.median(np.einsum("nij,nj->ni", T_map_node[:, :3, :3], ups), axis=0)
+    return np.asarray(up / np.linalg.norm(up))
+
+
 def are_on_floor(
-    motions: Sequence[Edge], T_map_node: NDArray[np.float64], up_node: Vector, up_map: Vector
+    edges: Sequence[Edge], T_map_node: NDArray[np.float64], up_node: Vector, up_map: Vector
 ) -> bool:
     """Tell whether motions lie in the floor of their nodes (N, 4, 4) as well as in a level one.
 
     `up_node` (3,) is the normal of the first, in every node, `up_map` that of the second. A robot
     moves in the plane that it stands on; what is carried by hand tilts whichever way it moves.
     """
+    motions = [edge for edge in edges if edge.kind is EdgeKind.MOTION]
     T_first_second = np.array([motion.T_first_second for motion in motions]).reshape(-1, 4, 4)
     firsts = T_map_node[[motion.first for motion in motions], :3, :3]
     steps = T_first_second[:, :3, 3]
