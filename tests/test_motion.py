@@ -17,10 +17,10 @@ FREE = Rig(sensors=frozenset({Sensor.DEPTH}))
 class Drive:
     """A robot that drives, its wheels, and a model that scans teach."""
 
-    def __init__(self, *, noise=0.005, seed=0, rig=WHEELED):
+    def __init__(self, *, noise=0.005, seed=0, rig=WHEELED, period_s=PERIOD_S):
         self.rng = np.random.default_rng(seed)
         self.model = MotionModel(rig)
-        self.noise = noise
+        self.noise, self.period_s = noise, period_s
         self.stamp_ns, self.T_odom_base = 0, se3.from_xy_yaw(3.0, -1.0, 2.0)
         self.model.predict(self.observation())
 
@@ -29,13 +29,13 @@ class Drive:
 
     def step(self, speed=0.5, rate=0.2, *, factor=1.0, pull=0.0, gyro=None, teaches=True):
         """Drive one step; return the prediction's error in the direction of driving [m]."""
-        forward_m, turn_rad = speed * PERIOD_S, rate * PERIOD_S
+        forward_m, turn_rad = speed * self.period_s, rate * self.period_s
         T_true = se3.from_xy_yaw(forward_m, 0.0, turn_rad)
         wheels = np.array([factor * forward_m, 0.0, turn_rad + pull * forward_m])
         amounts = np.array([forward_m, forward_m, turn_rad])
         wheels += self.noise * np.sqrt(np.abs(amounts)) * self.rng.standard_normal(3)
         self.T_odom_base = self.T_odom_base @ se3.from_xy_yaw(*wheels)
-        self.stamp_ns += round(PERIOD_S * 1e9)
+        self.stamp_ns += round(self.period_s * 1e9)
         motion = self.model.predict(self.observation(gyro))
         if teaches:
             seen = np.sqrt(np.diag(SCAN)) * self.rng.standard_normal(6)
@@ -90,6 +90,28 @@ def test_lie_of_some_seconds_does_not_spoil_what_was_learnt():
     for _ in range(50):
         drive.step(factor=-1.0)
     assert drive.model.noise_ratios == pytest.approx(before, rel=0.3)
+
+
+@pytest.mark.parametrize("noise", [0.02, 0.07])
+@pytest.mark.parametrize("period_s", [1 / 30, 0.1])
+def test_noise_is_no_lie(noise, period_s):
+    drive = Drive(noise=noise, period_s=period_s)
+    doubted = []
+    for index in range(round(40.0 / period_s)):
+        drive.step(speed=0.6 + 0.4 * np.sin(index * period_s))
+        doubted.append(drive.last.is_doubted)
+    assert np.mean(doubted) < 0.02
+
+
+def test_odometry_that_is_missing_once_is_no_lie():
+    drive = Drive()
+    for _ in range(100):
+        drive.step()
+    before = drive.model.lying
+    drive.stamp_ns += round(PERIOD_S * 1e9)
+    drive.model.predict(Observation(stamp_ns=drive.stamp_ns))
+    drive.model.learn(se3.from_xy_yaw(0.05, 0.0, 0.02), SCAN)
+    assert drive.model.lying == pytest.approx(before, abs=0.01)
 
 
 @pytest.mark.parametrize("factor", [-1.0, 0.0, 2.0])

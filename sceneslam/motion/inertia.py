@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.motion.motion import BELIEVED, KEPT_S, Step, still
-from sceneslam.motion.trust import NoiseRatio, student_cost
+from sceneslam.motion.trust import NoiseRatio, evidence_of_a_lie
 from sceneslam.types import se3
 from sceneslam.types.covariance import UNKNOWN_VELOCITY, Matrix, updated
 
@@ -94,18 +94,15 @@ class Inertia:
     def evidence(self, wheels: Step, guess: Step, duration_s: float) -> NDArray[np.float64]:
         """Return the log-likelihood ratios (2,) of the wheels' motion: wheels wrong against right.
 
-        Distance and turn. Wheels that are wrong may report any motion that a robot is capable of.
+        Distance and turn, by what inertia predicts.
         """
         if not self.is_known:
             return np.zeros(2)
         off = se3.inverse(guess.T) @ wheels.T
         missed = np.array([off[0, 3], se3.yaw_rad(off)])
         changed = _USUAL[self.has_wheels] * _ACCELERATION * self._unmeasured_s * duration_s
-        right = self._known(duration_s) + changed**2 + wheels.variance + self.missed**2
-        wrong = right + (UNKNOWN_VELOCITY * duration_s) ** 2
-        cost_right = student_cost(missed**2 / right, 1) + 0.5 * np.log(right)
-        cost_wrong = student_cost(missed**2 / wrong, 1) + 0.5 * np.log(wrong)
-        return np.asarray(cost_right - cost_wrong)
+        variance = self._known(duration_s) + changed**2 + wheels.variance + self.missed**2
+        return evidence_of_a_lie(missed, variance, duration_s)
 
     def noise_of(
         self, wheels: Step, lying: NDArray[np.float64], duration_s: float

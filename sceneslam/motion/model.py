@@ -9,7 +9,7 @@ a module is not calibrated by that module.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from sceneslam.motion.motion import BELIEVED, Motion, Step, motion_of, still
 from sceneslam.motion.trust import LieDetector, NoiseRatio, evidence_of_a_lie
 from sceneslam.motion.turn_errors import TurnErrors
 from sceneslam.types import se3
-from sceneslam.types.covariance import updated
+from sceneslam.types.covariance import Matrix, updated
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.se3 import Transform
@@ -33,6 +33,26 @@ _LATE_M, _SPEED_MAX_M_S = 1.0, 25.0  # odometry that moves farther was reset
 _TAUGHT_MIN = 0.25  # least weight of wheels that are probably wrong, in estimating their noise
 _WEAR = 1e-3  # change of the wheels' scale from one scan to the next, as a share of its deviation
 _PLANAR = np.array([0, 1, 5])  # forward, left, yaw
+_COMPARED_S = 0.1  # least interval: an image's noise hides the wheels' errors in a shorter one
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Compared:
+    """A measured motion (4, 4) with its covariance (6, 6), and the wheels' motion."""
+
+    duration_s: float
+    T: Transform
+    covariance: Matrix
+    wheels: Step
+
+    def then(self, later: Compared) -> Compared:
+        """Return this motion followed by another; the errors of the pose between them cancel."""
+        return Compared(
+            self.duration_s + later.duration_s,
+            self.T @ later.T,
+            (self.covariance + later.covariance) / 2.0,
+            self.wheels.then(later.wheels),
+        )
 
 
 class MotionModel:
@@ -58,6 +78,7 @@ class MotionModel:
         self._since_guess = still()
         self._is_weighed = False  # the sensor weighs the sources itself, and may clear the wheels
         self._is_followed = True  # `stop` was not called since then
+        self._compared: Compared | None = None  # too short so far to compare the wheels with
 
     @property
     def noise_ratios(self) -> NDArray[np.float64]:
@@ -131,38 +152,41 @@ class MotionModel:
 
         `covariance` (6, 6) is the measurement's alone, without any prediction: large in
         directions that the sensor did not measure. Axes of `now`. `evidence` (2,) of distance and
-        turn is that of `Motion.evidence`; None: that of the measured motion.
+        turn is that of `Motion.evidence`; None: that of measured motions.
         """
         self._is_weighed = evidence is not None
-        duration_s, wheels, guess = self._since_s, self._since_wheels, self._since_guess
-        had_velocity = self.inertia.is_known
+        duration_s, guess = self._since_s, self._since_guess
+        wheels = self._since_wheels if self._gap is None else None  # in a gap they are behind
         if duration_s <= 0.0 or not self._is_followed:  # the interval is unknown
             self.skip()
             return
         if evidence is not None:
             self._judge(evidence)
         self.inertia.learn(
-            *self._with_wheels(T_before_now, covariance), guess=guess, duration_s=duration_s
+            *self._with_wheels(T_before_now, covariance, wheels),
+            guess=guess,
+            duration_s=duration_s,
         )
         self._forget()
         if wheels is None:
+            self._compared = None
             return
-        measured = covariance[np.ix_(_PLANAR, _PLANAR)]
-        off, off_guess = (
-            se3.log(se3.inverse(step.T) @ T_before_now)[_PLANAR] for step in (wheels, guess)
-        )
+        compared = Compared(duration_s, T_before_now, covariance, wheels)
+        self._compared = compared if self._compared is None else self._compared.then(compared)
+        if self._compared.duration_s >= _COMPARED_S:
+            self._compare(self._compared)
+            self._compared = None
+
+    def _compare(self, compared: Compared) -> None:
+        """Calibrate the wheels by a measured motion."""
+        wheels = compared.wheels
+        off = se3.log(se3.inverse(wheels.T) @ compared.T)[_PLANAR]
+        measured = compared.covariance[np.ix_(_PLANAR, _PLANAR)]
+        if not self._is_weighed:
+            variance = wheels.variance + np.diag(measured)[[0, 2]]
+            self._judge(evidence_of_a_lie(off[[0, 2]], variance, compared.duration_s))
         for channel, axes in enumerate((slice(0, 2), slice(2, 3))):
             R = measured[axes, axes]
-            if evidence is None and had_velocity:
-                self._lies[channel].judge(
-                    evidence_of_a_lie(
-                        wheels=off[axes],
-                        guess=off_guess[axes],
-                        wheels_variance=float(wheels.variance[channel]),
-                        guess_variance=float(guess.variance[channel]),
-                        covariance=R,
-                    )
-                )
             for missed, variance in zip(off[axes].tolist(), np.diag(R).tolist(), strict=True):
                 self._noise[channel].learn(
                     missed,
@@ -189,10 +213,9 @@ class MotionModel:
             lie.judge(one)
 
     def _with_wheels(
-        self, T_before_now: Transform, covariance: NDArray[np.float64]
+        self, T_before_now: Transform, covariance: NDArray[np.float64], wheels: Step | None
     ) -> tuple[Transform, NDArray[np.float64]]:
         """Return a measured motion, completed by the wheels where it is weak."""
-        wheels = self._since_wheels
         if wheels is None:
             return T_before_now, covariance
         R = np.diag((self.inertia.noise_of(wheels, self.lying, self._since_s))[[0, 0, 1]])
@@ -203,13 +226,13 @@ class MotionModel:
     def skip(self) -> None:
         """Discard the motion since the last call, which no sensor measured."""
         self._forget()
-        self._is_followed = True
+        self._compared, self._is_followed = None, True
 
     def stop(self) -> None:
         """Reset velocity and odometry: the base is no longer tracked."""
         self.inertia.reset()
         self._forget()
-        self._since_wheels, self._is_followed = None, False
+        self._since_wheels, self._compared, self._is_followed = None, None, False
 
     def _forget(self) -> None:
         """Restart the comparison; odometry that is missing now has to restart, too."""

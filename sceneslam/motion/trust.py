@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.types.covariance import Matrix
+from sceneslam.types.covariance import UNKNOWN_VELOCITY, Matrix
 
 _DOUBT = 10.0  # weight of the prior of a noise, in comparisons
 _MEMORY = 200.0  # comparisons in its posterior, about
@@ -80,31 +80,19 @@ class LieDetector:
 
 
 def evidence_of_a_lie(
-    *,
-    wheels: NDArray[np.float64],
-    guess: NDArray[np.float64],
-    wheels_variance: float,
-    guess_variance: float,
-    covariance: Matrix,
-) -> float:
-    """Return the log-likelihood ratio of a measured motion: wheels wrong against wheels right.
+    missed: NDArray[np.float64], variance: NDArray[np.float64], duration_s: float
+) -> NDArray[np.float64]:
+    """Return the log-likelihood ratios (2,) of the wheels' motion: wheels wrong against right.
 
-    `wheels`, `guess` (N,): difference of the wheels' and of the predicted motion from the measured
-    one, whose `covariance` is (N, N). A good prediction at constant velocity is no evidence against
-    wheels that are right within their noise.
+    `missed` (2,) [m, rad]: distance and turn by which wheels differ from another source's motion in
+    `duration_s`; `variance` (2,) is that of both together. Wheels that are wrong may report any
+    motion that a robot is capable of.
     """
-    unit = np.eye(len(wheels))
-    by_inertia = _log_likelihood(guess, max(guess_variance, wheels_variance) * unit + covariance)
-    return by_inertia - _log_likelihood(wheels, wheels_variance * unit + covariance)
+    wrong = variance + (UNKNOWN_VELOCITY * duration_s) ** 2
+    cost, cost_wrong = (student_cost(missed**2 / v, 1) + 0.5 * np.log(v) for v in (variance, wrong))
+    return np.asarray(cost - cost_wrong)
 
 
 def student_cost(squared: Matrix | float, size: int, freedom: float = _STUDENT) -> Matrix:
     """Return the negative log-density of Student's distribution at squared normalised errors."""
     return np.asarray(0.5 * (freedom + size) * np.log1p(squared / freedom))
-
-
-def _log_likelihood(missed: NDArray[np.float64], covariance: Matrix) -> float:
-    """Return the log-density of an error (N,) under a normal distribution, up to a constant."""
-    factor = np.linalg.cholesky(covariance)
-    whitened = np.linalg.solve(factor, missed)
-    return float(-0.5 * whitened @ whitened - np.log(np.diag(factor)).sum())
