@@ -9,7 +9,12 @@ from hypothesis import strategies as st
 from ros_recordings import make_source
 
 from sceneslam.sources.carmen import Carmen
-from sceneslam.sources.rising import longest_rising, measured_stamps, rising_stamps
+from sceneslam.sources.rising import (
+    continued_stamps,
+    longest_rising,
+    measured_stamps,
+    rising_stamps,
+)
 from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.se3 import from_xy_yaw
 
@@ -162,6 +167,27 @@ def test_a_clock_that_is_set_back_leaves_the_order_and_is_told(
     assert "1 of 4 scans" in record.getMessage()
 
 
+@pytest.mark.parametrize("set_back_s", [10, 3600])
+@pytest.mark.parametrize("wrong", [(), (20,), (20, 21), (60,), (99,)])
+def test_scans_after_the_clock_was_set_back_keep_their_rate(
+    set_back_s: int, wrong: tuple[int, ...]
+) -> None:
+    """Single stamps, and some in a row, may be missing as well."""
+    true_ns = 10**18 + np.arange(100) * 200_000_000
+    logged_ns = true_ns - np.where(np.arange(100) < 50, 0, set_back_s * 10**9)
+    logged_ns[list(wrong)] = 0
+    found_ns = continued_stamps(logged_ns, 2 * 10**9)
+    assert (np.diff(found_ns) > 0).all()
+    good = np.setdiff1d(np.arange(100), wrong)
+    np.testing.assert_allclose(found_ns[good] - 10**18, true_ns[good] - 10**18, atol=1000)
+
+
+def test_a_log_whose_stamps_are_all_zero_is_stamped_by_its_logger(tmp_path: Path) -> None:
+    lines = [flaser([2.0] * 180, "0")[: -len("0.1")] + f"{0.2 * number:.1f}" for number in range(5)]
+    source = make_source("carmen", write(tmp_path / "a.log", *lines))
+    assert [one.stamp_ns for one in source] == [0, 2 * 10**8, 4 * 10**8, 6 * 10**8, 8 * 10**8]
+
+
 def test_files_without_scans_are_one_sentence(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="not found"):
         make_source("carmen", tmp_path / "nowhere.log")
@@ -178,6 +204,8 @@ def test_stamps_are_made_to_rise_with_the_fewest_changes(places: list[int]) -> N
     rising = rising_stamps(stamps_ns)
     assert (np.diff(rising) > 0).all()
     assert (rising == stamps_ns).sum() >= len(longest_rising(stamps_ns))
+    if places:
+        assert (np.diff(continued_stamps(stamps_ns, 2 * 10**9)) > 0).all()
 
 
 def test_one_late_stamp_is_set_between_its_neighbours() -> None:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from sceneslam.ros.pixels import locked
 from sceneslam.sources.carmen_lines import (
     FLASER,
+    LOGGER_STAMP,
     ROBOTLASER,
     ScanLine,
     parse_scan,
@@ -20,7 +21,7 @@ from sceneslam.sources.carmen_lines import (
     stamp_of,
 )
 from sceneslam.sources.intrinsics import checked_above_zero
-from sceneslam.sources.rising import measured_stamps, rising_stamps
+from sceneslam.sources.rising import continued_stamps, measured_stamps, rising_stamps
 from sceneslam.sources.stamped_scans import StampedScans
 from sceneslam.sources.survey.survey import Stream, Survey, spread
 from sceneslam.types import se3
@@ -31,7 +32,7 @@ from sceneslam.types.rig import Laser, Rig, Sensor, Wheels
 from sceneslam.types.truth import GroundTruth
 
 _LOG = logging.getLogger(__name__)
-_LATE_MAX_S = 2.0  # stamps are out of order by less; a clock that is set jumps farther
+_LATE_MAX_NS = 2_000_000_000  # stamps are out of order by less; a clock that is set jumps farther
 _AXLE_M = 0.05  # a log does not say where the laser is above the axle: some centimetres off
 _SAMPLES = 20  # scans that are read for a survey
 _OFFSET = b"robot_frontlaser_offset"
@@ -47,7 +48,7 @@ class Carmen(StampedScans):
     Observations come in the order in which the wheels' path is the shorter one, the lines' or the
     stamps', at the estimated times of measurement; `logged_ns` returns the log's stamps, by which
     relations refer to scans. Where the clock was set back or a stamp is missing, these are made to
-    rise first.
+    rise first. A log whose stamps never rise is stamped by its logger.
     """
 
     def __init__(self, path: str, range_max_m: float, wheels: Mapping[str, float] | None) -> None:
@@ -57,7 +58,7 @@ class Carmen(StampedScans):
         first = next((scan for scan in map(parse_scan, self._lines) if scan), None)
         if first is None:
             raise InputError(f"no scans, expected FLASER or ROBOTLASER1 lines: {path}")
-        logged_ns = np.array([stamp_of(line) for line in self._lines], dtype=np.int64)
+        logged_ns = _logged_stamps(self._lines)
         distinct_ns = _distinct_stamps(logged_ns)
         self._warn_of_changed(np.flatnonzero(distinct_ns != logged_ns), distinct_ns)
         order = _driven_order(self._lines, distinct_ns)
@@ -137,7 +138,7 @@ class Carmen(StampedScans):
         if len(changed):
             _LOG.warning(
                 "%d of %d scans, first at %.3f s, have stamps that do not rise; they were given "
-                "stamps between their neighbours': %s",
+                "rising ones: %s",
                 len(changed),
                 len(self._lines),
                 stamps_ns[changed[0]] * 1e-9,
@@ -167,11 +168,21 @@ class Carmen(StampedScans):
         return 0.0
 
 
+def _logged_stamps(lines: Sequence[bytes]) -> NDArray[np.int64]:
+    """Return the stamps (N,) of receipt of all lines; those of the logger if none rises."""
+    received_ns = np.array([stamp_of(line) for line in lines], dtype=np.int64)
+    if len(lines) == 1 or (np.diff(received_ns) > 0).any():
+        return received_ns
+    _LOG.warning("no ipc_timestamp is after the one before: those of the logger are taken")
+    return np.array([stamp_of(line, LOGGER_STAMP) for line in lines], dtype=np.int64)
+
+
 def _distinct_stamps(logged_ns: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return a stamp of its own for each line (N,); rising by line where the clock was set."""
     late_ns = (np.maximum.accumulate(logged_ns) - logged_ns).max()
-    was_set = late_ns > _LATE_MAX_S * 1e9
-    order = np.arange(len(logged_ns)) if was_set else np.argsort(logged_ns, kind="stable")
+    if late_ns > _LATE_MAX_NS:
+        return continued_stamps(logged_ns, _LATE_MAX_NS)
+    order = np.argsort(logged_ns, kind="stable")
     distinct_ns = np.empty_like(logged_ns)
     distinct_ns[order] = rising_stamps(logged_ns[order])
     return distinct_ns

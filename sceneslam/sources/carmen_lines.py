@@ -13,6 +13,7 @@ from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import parse_stamp_ns
 
 FLASER, ROBOTLASER = b"FLASER ", b"ROBOTLASER1 "
+IPC_STAMP, LOGGER_STAMP = -3, -1  # places in a line, from its end: when received, when logged
 _HALF_TURN_COUNTS = {
     180: 1.0,
     181: 1.0,
@@ -44,11 +45,11 @@ def parse_scan(line: bytes) -> ScanLine | None:
     return scan if _is_finite(scan) else None
 
 
-def stamp_of(line: bytes) -> int:
-    """Return the `ipc_timestamp` [ns] of a line, the third word from its end; 0 if invalid."""
+def stamp_of(line: bytes, place: int = IPC_STAMP) -> int:
+    """Return the stamp [ns] of a line at `place`, IPC_STAMP or LOGGER_STAMP; 0 if invalid."""
     words = line.rsplit(maxsplit=3)
     try:
-        return parse_stamp_ns(words[1].decode()) if len(words) == 4 else 0
+        return parse_stamp_ns(words[place].decode()) if len(words) == 4 else 0
     except ValueError:
         return 0
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 _SPAN = 200  # scans over which the period is measured: bursts average out
 _BACKLOG = 20  # scans that wait at most until they are stamped: 3.3 s in Intel's log
 _CLOSEST = 0.1  # of the period: so far apart are any two scans
+_STEP_NS = np.int64(1_000_000)  # between stamps of which nothing is known
 _FASTER = 0.8  # of the usual period: the scanner turns faster; a backlog makes 0.9 of a mean
 
 
@@ -32,24 +33,68 @@ def longest_rising(stamps_ns: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.array(kept[::-1], dtype=np.int64)
 
 
-def rising_stamps(stamps_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+def rising_stamps(
+    stamps_ns: NDArray[np.int64], believed: NDArray[np.bool_] | None = None
+) -> NDArray[np.int64]:
     """Return rising stamps (N,): those out of order are interpolated between neighbours.
 
-    At the ends, with one neighbour only, they are set 1 ms apart.
+    So are those that are not `believed` (N,). At the ends, with one neighbour only, they are set
+    1 ms apart.
     """
-    kept = longest_rising(stamps_ns)
+    places = np.arange(len(stamps_ns))
+    candidates = places if believed is None else np.flatnonzero(believed)
+    kept = candidates[longest_rising(stamps_ns[candidates])]
     if not len(kept):
         return stamps_ns
-    places = np.arange(len(stamps_ns))
     first, last = int(kept[0]), int(kept[-1])
     # Relative to the first, so that a float holds the nanoseconds.
     origin = int(stamps_ns[first])
     offsets = np.interp(places, kept, (stamps_ns[kept] - origin).astype(np.float64))
     rising: NDArray[np.int64] = np.rint(offsets).astype(np.int64) + origin
     rising[kept] = stamps_ns[kept]
-    rising[:first] = stamps_ns[first] - (first - places[:first]) * 1_000_000
-    rising[last + 1 :] = stamps_ns[last] + (places[last + 1 :] - last) * 1_000_000
+    rising[:first] = stamps_ns[first] - (first - places[:first]) * _STEP_NS
+    rising[last + 1 :] = stamps_ns[last] + (places[last + 1 :] - last) * _STEP_NS
     return rising
+
+
+def continued_stamps(stamps_ns: NDArray[np.int64], jump_ns: int) -> NDArray[np.int64]:
+    """Return rising stamps (N,) of a clock that was set: it goes on where it was set back.
+
+    Stamps between jumps of more than `jump_ns` are a run. One that lies before the run before it
+    begins a usual period after that, and so do all later ones. Single stamps, and runs after which
+    the clock is right again, are interpolated.
+    """
+    steps_ns = np.diff(stamps_ns)
+    usual_ns = steps_ns[(steps_ns > 0) & (steps_ns <= jump_ns)]
+    period_ns = np.int64(np.median(usual_ns)) if len(usual_ns) else _STEP_NS
+    starts = np.flatnonzero(np.abs(steps_ns) > jump_ns) + 1
+    joined_ns, believed = stamps_ns.copy(), np.ones(len(stamps_ns), dtype=bool)
+    runs, marks = np.split(joined_ns, starts), np.split(believed, starts)  # views
+    shift_ns, before_ns = np.int64(0), None
+    for place, (run_ns, mark) in enumerate(zip(runs, marks, strict=True)):
+        after_ns = runs[place + 1][0] if place + 1 < len(runs) else None
+        if _is_undone(before_ns, run_ns, after_ns, jump_ns):
+            mark[:] = False
+            continue
+        if before_ns is not None and before_ns - run_ns[0] > jump_ns:
+            shift_ns += before_ns - run_ns[0] + period_ns
+        before_ns = run_ns[-1].copy()
+        run_ns += shift_ns
+    return rising_stamps(joined_ns, believed)
+
+
+def _is_undone(
+    before_ns: np.int64 | None, run_ns: NDArray[np.int64], after_ns: np.int64 | None, jump_ns: int
+) -> bool:
+    """Tell whether only a run (M,) is wrong: the stamp after it goes on from the one before it."""
+    if after_ns is None:
+        return False
+    if before_ns is None:
+        return len(run_ns) == 1 and bool(after_ns < run_ns[0])
+    is_between = before_ns <= run_ns[0] and run_ns[-1] <= after_ns
+    if is_between or after_ns < before_ns:
+        return False
+    return len(run_ns) == 1 or abs(after_ns - before_ns - (run_ns[-1] - run_ns[0])) <= jump_ns
 
 
 def measured_stamps(received_ns: NDArray[np.int64]) -> NDArray[np.int64]:
