@@ -367,6 +367,27 @@ def test_given_intrinsics_replace_those_of_a_lens_that_opencv_does_not_have(tmp_
     assert found.fy == 41.0 and not any(found.distortion)
 
 
+@pytest.mark.parametrize("what", ["lens", "encoding", "size"])
+def test_camera_that_cannot_be_used_says_how_to_do_without(tmp_path: Path, what: str) -> None:
+    info = camera_info(p=[0.0] * 8)
+    if what == "lens":
+        info.distortion_model, info.d = "equidistant", np.full(4, 0.1)
+    if what == "size":
+        info.width = 80
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        recorder.add("/cam/camera_info", STAMP_NS, info)
+        recorder.image("/cam/image_raw", STAMP_NS, COLOR, "nv21" if what == "encoding" else "bgr8")
+        recorder.scan("/scan", STAMP_NS, [1.0] * 20)
+    with pytest.raises(InputError) as caught:
+        make_source("mcap", tmp_path / "a.mcap")
+    assert "or do without /cam/image_raw: source.topics.image=none" in str(caught.value)
+    (one,) = make_source("mcap", tmp_path / "a.mcap", topics={"image": "none"})
+    assert one.has(Sensor.SCAN)
+    with pytest.raises(InputError) as alone:
+        make_source("mcap", tmp_path / "a.mcap", topics={"scan": "none"})
+    assert "do without" not in str(alone.value)
+
+
 def camera_info(p: list[float]) -> Any:
     """Return a CameraInfo with the first two rows of a projection."""
     camera = Camera(size_wh=(40, 30), fx=50.0, fy=51.0, cx=20.0, cy=15.0)

@@ -14,7 +14,7 @@ from sceneslam.ros import decode, names, pixels
 from sceneslam.sources.bag.frames import FrameTree, has_base_name
 from sceneslam.sources.bag.observation import Mounts
 from sceneslam.sources.bag.recording import Recording
-from sceneslam.sources.bag.topics import BagTopics, first, inertial_sensors, infos_of
+from sceneslam.sources.bag.topics import NONE, BagTopics, first, inertial_sensors, infos_of
 from sceneslam.sources.intrinsics import Intrinsics
 from sceneslam.types import se3
 from sceneslam.types.errors import InputError
@@ -59,7 +59,7 @@ def sensor_topics(
 
 
 def make_rig(recording: Recording, topics: BagTopics, frames: FrameTree, given: Given) -> Rig:
-    """Return the rig; raises InputError for depth without intrinsics."""
+    """Return the rig; raises InputError for a camera that cannot be used, and says how to go on."""
     said = recording.metadata.get(names.RIG_METADATA, {})
     laser = lidar = None
     if topics.scan:
@@ -72,7 +72,10 @@ def make_rig(recording: Recording, topics: BagTopics, frames: FrameTree, given: 
     camera = None
     if topics.image or topics.depth:
         depth_range_m = given.depth_range_m or _said(said, "depth_range_m") or _DEPTH_RANGE_M
-        camera = _camera(recording, topics, frames, given.intrinsics, depth_range_m)
+        try:
+            camera = _camera(recording, topics, frames, given.intrinsics, depth_range_m)
+        except InputError as err:
+            raise InputError(f"{err}{_way_without_camera(topics)}") from err
     sensors = frozenset(sensor_topics(recording, topics))
     return Rig(sensors=sensors, camera=camera, laser=laser, lidar=lidar, wheels=given.wheels)
 
@@ -225,6 +228,15 @@ def _camera(
         depth_range_m=depth_range_m,
         T_base_cam=optical_to_rep103() if T_base_cam is None else T_base_cam,
     )
+
+
+def _way_without_camera(topics: BagTopics) -> str:
+    """Return how a run does without its camera, "" if it has no other sensor."""
+    if not (topics.scan or topics.points or topics.odometry):
+        return ""
+    used = {need: topic for need in ("image", "depth") if (topic := getattr(topics, need))}
+    keys = " ".join(f"source.topics.{need}={NONE}" for need in used)
+    return f"; or do without {' and '.join(used.values())}: {keys}"
 
 
 def _said(said: Any, key: str) -> tuple[float, float] | None:
