@@ -220,6 +220,21 @@ class Driving:
         return self.own.finish(lambda ns: self.path.known[ns].T_map_base, [])
 
 
+def test_a_scan_after_a_handover_lies_as_the_replaced_poses_moved():
+    """It drives at 0.5 m/s, 0.1 m beside them; the middle of a sweep is 50 ms ahead."""
+    path, step_ns = Path(), S // 10
+    own = Mapper(SCANNING, known=path, note=lambda *_, **__: None)
+    for index in range(16):
+        if index == 15:
+            own.rewind(8 * step_ns)
+            for row in range(8, 15):
+                path.put(row * step_ns, 0.05 * row, session=1)
+        path.put(index * step_ns, 0.05 * index, session=index // 15)
+        own.observe(Observation(stamp_ns=index * step_ns), None)
+    T_base_then = own._trail.base_at(15 * step_ns + step_ns // 2)
+    np.testing.assert_allclose(T_base_then, at(0.025), atol=1e-3)
+
+
 class Solving:
     """A graph that finds a loop between the ends of what it is given, and moves all by 1 m."""
 

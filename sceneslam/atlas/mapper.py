@@ -68,6 +68,7 @@ class Mapper:
         self._loaded = loaded if loaded is not None else empty_map()
         self._scanner, self._known, self._note = KeyScanner(rig), known, note
         self._trail = Trail()
+        self._is_rewound = False  # so that the trail is of poses that were replaced
         views = self._loaded.views()
         self._views = ViewTaker(rig, is_keeping=keeps_views, is_comparing=bool(views))
         self._collector = Collector(rig, known, self._loaded.runs, self._views.locate)
@@ -134,6 +135,7 @@ class Mapper:
         self._search.rewind(stamp_ns)
         self._collector.rewind(stamp_ns)
         self._views.rewind(stamp_ns)
+        self._is_rewound = True
         kept = len(self._collector.chain)
         if kept < self._kept:
             self._is_news |= bool(self._solved.loops)
@@ -147,6 +149,8 @@ class Mapper:
         stamp_ns, search = observation.stamp_ns, self._search
         self._views.move(stamp_ns, known.T_map_base)
         self._collect_loops()
+        if self._is_rewound:
+            self._trail, self._is_rewound = self._trail.retraced(self._pose_at), False
         is_begun = self._collector.has_begun(known)
         if is_begun:
             search.restart(known.begun_ns)

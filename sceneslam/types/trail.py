@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from bisect import bisect_left
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.types import se3
+from sceneslam.types.covariance import UNKNOWN_VELOCITY
 from sceneslam.types.observation import SWEEP_MAX_S
 from sceneslam.types.se3 import Transform
 
@@ -23,14 +25,29 @@ class Trail:
     _poses: list[Transform] = field(default_factory=list)
 
     def add(self, stamp_ns: int, T_w_base: Transform) -> None:
-        """Go on to a pose (4, 4) [m]; what is known of its stamp or later is replaced."""
-        kept = slice(self._count_before(stamp_ns - _KEPT_NS), self._count_before(stamp_ns))
-        self._stamps_ns = [*self._stamps_ns[kept], stamp_ns]
-        self._poses = [*self._poses[kept], T_w_base]
+        """Go on to a pose (4, 4) [m]; what is known of its stamp or later is replaced.
+
+        A pose that a loop or a hand-over moved tells no velocity: the trail begins anew there.
+        """
+        self._keep(slice(self._count_before(stamp_ns)))
+        before_s, had_velocity = self.twist_s, len(self._poses) > 1
+        self._append(stamp_ns, T_w_base)
+        change_s = np.linalg.norm((self.twist_s - before_s).reshape(2, 3), axis=1)
+        if had_velocity and (change_s > UNKNOWN_VELOCITY).any():
+            self._keep(slice(-1, None))
 
     def move(self, stamp_ns: int, T_prev_base: Transform) -> None:
         """Go on by the motion (4, 4) [m] to an observation."""
-        self.add(stamp_ns, self._poses[-1] @ T_prev_base if self._poses else se3.identity())
+        self._append(stamp_ns, self._poses[-1] @ T_prev_base if self._poses else se3.identity())
+
+    def retraced(self, pose_at: Callable[[int], Transform | None]) -> Trail:
+        """Return the trail of the poses (4, 4) [m] that there are now at the same stamps."""
+        trail = Trail()
+        for stamp_ns in self._stamps_ns:
+            T_w_base = pose_at(stamp_ns)
+            if T_w_base is not None:
+                trail.add(stamp_ns, T_w_base)
+        return trail
 
     def base_at(self, stamp_ns: int) -> Transform:
         """Return T_base_then (4, 4) [m]: the base at a stamp, in the newest.
@@ -57,6 +74,14 @@ class Trail:
         T_prev_base = se3.inverse(self._poses[-2]) @ self._poses[-1]
         step_s = (self._stamps_ns[-1] - self._stamps_ns[-2]) * 1e-9
         return np.asarray(se3.log(T_prev_base) / step_s)
+
+    def _append(self, stamp_ns: int, T_w_base: Transform) -> None:
+        self._keep(slice(self._count_before(stamp_ns - _KEPT_NS), self._count_before(stamp_ns)))
+        self._stamps_ns.append(stamp_ns)
+        self._poses.append(T_w_base)
+
+    def _keep(self, kept: slice) -> None:
+        self._stamps_ns, self._poses = self._stamps_ns[kept], self._poses[kept]
 
     def _count_before(self, stamp_ns: int) -> int:
         return bisect_left(self._stamps_ns, stamp_ns)
