@@ -194,6 +194,22 @@ def test_a_recording_without_any_sensor_says_what_it_has(tmp_path: Path) -> None
         make_source("mcap", path, topics={"image": "none"})
 
 
+@pytest.mark.parametrize("encoding", ["protobuf", "json"])
+def test_a_recording_in_an_encoding_that_is_not_read_names_it(
+    tmp_path: Path, encoding: str
+) -> None:
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        writer = recorder._writer
+        schema = writer.register_schema("foxglove.CompressedImage", encoding, b"{}")
+        channel = writer.register_channel("/cam", encoding, schema)
+        writer.add_message(channel, STAMP_NS, b"{}", STAMP_NS)
+    expected = rf"/cam \(foxglove\.CompressedImage, {encoding}\): only cdr and ros1 are read"
+    with pytest.raises(InputError, match=expected):
+        make_source("mcap", tmp_path / "a.mcap")
+    with pytest.raises(ConfigError, match=expected):
+        make_source("mcap", tmp_path / "a.mcap", topics={"image": "/cam"})
+
+
 def rgbd(path: Path, **camera_info: Any) -> Path:
     with Recorder(path) as recorder:
         for index in range(3):

@@ -21,7 +21,7 @@ from sceneslam.sources.bag.recording import (
 )
 from sceneslam.types.errors import InputError
 
-_ENCODINGS = ("cdr", "ros1")
+ENCODINGS = ("cdr", "ros1")
 _KEPT = (records.SCHEMA, records.CHANNEL, records.MESSAGE, records.CHUNK, records.METADATA)
 
 
@@ -113,7 +113,9 @@ class McapFile:
             chunks += self._messages_between(file, begin, entry.chunk_start_offset)
             begin = entry.chunk_start_offset + entry.chunk_length + entry.message_index_length
         chunks += self._messages_between(file, begin, self._path.stat().st_size)
-        return Layout(chunks=chunks, topics=topics, metadata=metadata)
+        return Layout(
+            chunks=chunks, topics=topics, metadata=metadata, skipped=list(_skipped(content))
+        )
 
     def _messages_between(self, file: IO[bytes], begin: int, end: int) -> Iterator[Chunk]:
         """Yield the messages in a part of the file without chunks, each as a chunk of its own."""
@@ -175,7 +177,12 @@ class McapFile:
         elif not is_complete:
             note = cut_off(chunks, topics)
         return Layout(
-            chunks=chunks, topics=topics, metadata=content.metadata, lost_bytes=lost, note=note
+            chunks=chunks,
+            topics=topics,
+            metadata=content.metadata,
+            lost_bytes=lost,
+            note=note,
+            skipped=list(_skipped(content)),
         )
 
     def _named(self, channels: Iterable[int]) -> frozenset[str]:
@@ -187,7 +194,7 @@ class McapFile:
         for number, channel in content.channels.items():
             schema = content.schemas.get(channel.schema_id)
             count = content.counts[number]
-            if channel.message_encoding not in _ENCODINGS or schema is None or not count:
+            if channel.message_encoding not in ENCODINGS or schema is None or not count:
                 continue
             self._names[number] = channel.topic
             known = topics.get(channel.topic)
@@ -201,3 +208,12 @@ class McapFile:
                 count=count + (known.count if known else 0),
             )
         return topics
+
+
+def _skipped(content: records.Content) -> Iterator[str]:
+    """Yield the topics, with type and encoding, whose encoding is not read."""
+    for number, channel in content.channels.items():
+        if content.counts[number] and channel.message_encoding not in ENCODINGS:
+            schema = content.schemas.get(channel.schema_id)
+            name = "" if schema is None else f"{schema.name}, "
+            yield f"{channel.topic} ({name}{channel.message_encoding})"

@@ -84,6 +84,7 @@ class FolderRecording:
             self._reader.open()
         weakref.finalize(self, self._reader.close)
         self.faults: Sequence[str] = ()
+        self.skipped: Sequence[str] = ()
         self.is_slow = False
         self.metadata: Mapping[str, Mapping[str, str]] = {}
         self.topics = self._read_topics()

@@ -31,6 +31,11 @@ class Recording(Protocol):
         ...
 
     @property
+    def skipped(self) -> Sequence[str]:
+        """Return the topics, with type and encoding, whose encoding is not read."""
+        ...
+
+    @property
     def faults(self) -> Sequence[str]:
         """Return one sentence per type of damage found so far."""
         ...
@@ -79,6 +84,7 @@ class Layout:
     metadata: Mapping[str, Mapping[str, str]]
     lost_bytes: int = 0  # bytes outside of all readable chunks
     note: str = ""  # sentence on the file's damage, "" without
+    skipped: Sequence[str] = ()  # topics, with type and encoding, whose encoding is not read
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -127,6 +133,7 @@ class ChunkedRecording:
         self._damaged: dict[Chunk, int] = {}
         self._recent: tuple[Chunk, ChunkContent] | None = None
         self.topics = _merge_topics(layouts)
+        self.skipped = sorted({one for layout in layouts for one in layout.skipped})
         self.metadata = {name: text for layout in layouts for name, text in layout.metadata.items()}
         self._decoder = MessageDecoder(self.topics)
 

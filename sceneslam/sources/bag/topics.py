@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from sceneslam.ros import decode, names
+from sceneslam.sources.bag.mcap_file import ENCODINGS
 from sceneslam.sources.bag.recording import Message, Recording
 from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.rig import Sensor
@@ -142,8 +143,10 @@ def infos_of(recording: Recording, picture: str) -> list[str]:
 
 
 def describe(recording: Recording) -> str:
-    """Return the topics and their types as text."""
-    return ", ".join(f"{name} ({kind.msgtype})" for name, kind in sorted(recording.topics.items()))
+    """Return the topics and their types as text, also those that are not read."""
+    known = (f"{name} ({kind.msgtype})" for name, kind in sorted(recording.topics.items()))
+    others = f"{', '.join(recording.skipped)}: only {' and '.join(ENCODINGS)} are read"
+    return "; ".join(filter(None, [", ".join(known), others if recording.skipped else ""]))
 
 
 def _check_given(recording: Recording, need: str, name: str | None) -> None:

@@ -38,6 +38,7 @@ class LiveRecording:
         self.is_latched = True  # every /tf_static that is announced
         self.metadata: Mapping[str, Mapping[str, str]] = {}
         self.faults: Sequence[str] = ()
+        self.skipped: Sequence[str] = ()
         self._held: dict[str, deque[Message]] = {}
         self._changed = threading.Lock()
         self._decoder = MessageDecoder(self.topics)
