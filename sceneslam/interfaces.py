@@ -317,8 +317,14 @@ class BackEnd(Protocol):
         """Return the stamp of the newest pose, None before the first."""
         ...
 
-    def begin_session(self, module: str, T_map_local: Transform) -> int:
-        """Begin a session of a module at T_map_local (4, 4) [m] (Eq. 1); return its index."""
+    def begin_session(
+        self, module: str, T_map_local: Transform, T_new_told: Transform | None = None
+    ) -> int:
+        """Begin a session of a module at T_map_local (4, 4) [m] (Eq. 1); return its index.
+
+        `T_new_told` (4, 4): how the module before it has corrected the last pose since that was
+        added; None: not at all.
+        """
         ...
 
     def add_local(self, stamp_ns: int, T_local_base: Transform) -> None:
@@ -452,7 +458,7 @@ class TrajectoryLog(Protocol):
         """Record that an observation was processed, and its pose reported as it is now."""
         ...
 
-    def add_session(self, module: str, T_map_local: Transform) -> None:
+    def add_session(self, module: str, T_map_local: Transform, T_new_told: Transform) -> None:
         """Record that a session of a module begins."""
         ...
 

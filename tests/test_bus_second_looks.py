@@ -186,24 +186,38 @@ def test_a_module_without_data_is_waited_for_beside_one_that_tracks(handover, wi
     assert modules["bright"].activations == 1
 
 
-class Closing(ExactModule):
+class Revised(ExactModule):
+    """It reports the path again at its end."""
+
+    def __init__(self):
+        super().__init__()
+        self.said = []
+
+    def track(self, observation):
+        told = super().track(observation)
+        self.said.append((observation.stamp_ns, told.T_local_base))
+        return told
+
+    def get_trajectory(self):
+        stamps_ns, poses = zip(*self.said, strict=True)
+        return Trajectory(stamps_ns=np.array(stamps_ns), T_world_base=np.stack(poses))
+
+
+class Closing(Revised):
     """It drifts by 0.5 m in 12 s, and closes a loop at 150; it may tell the path at the end."""
 
     def __init__(self, *, tells):
         super().__init__()
-        self.tells, self.said = tells, []
+        self.tells = tells
 
     def track(self, observation):
         told, index = super().track(observation), observation.stamp_ns // PERIOD_NS
-        self.said.append((observation.stamp_ns, told.T_local_base))
         aside = se3.from_xy_yaw(0.0, min(index / 240, 0.5) if index < 150 else 0.0, 0.0)
         T_local_base = aside @ told.T_local_base
         return replace(told, T_local_base=T_local_base, revision=int(index >= 150))
 
     def get_trajectory(self):
-        stamps_ns, poses = zip(*self.said, strict=True)
-        told = Trajectory(stamps_ns=np.array(stamps_ns), T_world_base=np.stack(poses))
-        return told if self.tells else Trajectory.empty()
+        return super().get_trajectory() if self.tells else Trajectory.empty()
 
 
 @pytest.mark.parametrize("tells", [True, False])
@@ -226,6 +240,38 @@ def test_a_loop_closed_after_the_scene_changed_is_kept_at_the_hand_over(
     for path in (atlas.online, atlas.trajectory):
         off_m = path.T_world_base[-1, :3, 3] - true_pose(229 * PERIOD_NS)[:3, 3]
         assert np.linalg.norm(off_m) < 1e-6
+
+
+def test_what_a_hand_over_reports_is_corrected_once(monkeypatch):
+    """The loop is closed while dark catches up; a third module begins at one of dark's poses."""
+    monkeypatch.setattr(ScriptedDetector, "scenes", ("Bright", "Dark", "Dim"))
+    modules = {"bright": Closing(tells=True), "dark": Revised(), "third": ExactModule()}
+    _, atlas, log, _ = drive(
+        modules,
+        table={"Bright": ["bright"], "Dark": ["dark"], "Dim": ["third"]},
+        scene_at=lambda index: "Bright" if index < 132 else "Dark" if index < 143 else "Dim",
+        handover="rewind",
+        steps=180,
+        catch_up_steps=2,
+        confirm_window_s=1.0,
+    )
+    assert [to for _, to, _ in decisions(log)] == ["bright", "dark", "third"]
+    assert_exact(atlas)
+
+
+def test_what_a_module_revises_of_replaced_poses_moves_no_other():
+    """From where it becomes dark, the module errs by 25 cm/s; at the end it repairs that."""
+
+    class Erring(Closing):
+        def track(self, observation):
+            told, index = super().track(observation), observation.stamp_ns // PERIOD_NS
+            aside = se3.from_xy_yaw(0.0, 0.025 * max(index - 110, 0), 0.0)
+            return replace(told, T_local_base=aside @ self.said[-1][1], revision=0)
+
+    modules = {"bright": Erring(tells=True), "dark": ExactModule()}
+    _, atlas, log, _ = drive(modules, steps=160, scene_at=dark_from(110), handover="rewind")
+    assert [to for _, to, _ in decisions(log)] == ["bright", "dark"]
+    assert_exact(atlas)
 
 
 class Revising(ExactModule):

@@ -55,6 +55,31 @@ def test_a_revised_session_carries_the_next_one_with_it(twist, error, placed):
     np.testing.assert_allclose(atlas.online.T_world_base[:5], T_map_local @ drifting[:5])
 
 
+@given(twist=twists, error=twists, placed=twists)
+def test_a_session_starts_where_the_last_pose_ended_that_it_did_not_replace(twist, error, placed):
+    """The first module is wrong from 3 on; a pose is bridged before the next session, one in it."""
+    atlas = Atlas(voxel_m=0.05)
+    true, T_map_local, T_new_told = drive(8, 0.1 * twist), se3.exp(placed), se3.exp(0.1 * error)
+    wrong = [0.0, 0.01, 0.02, 1.0, 2.0]
+    told = np.stack([true[i] @ se3.exp(w * error) for i, w in enumerate(wrong)])
+    first = add_session(atlas, "a", T_map_local, range(5), told)
+    atlas.rewind(3)
+    T_map_bridged = T_map_local @ told[2] @ se3.inverse(true[2]) @ true[3]
+    atlas.add(3, T_map_bridged, BRIDGED)
+    T_map_next = T_new_told @ T_map_bridged
+    second = atlas.begin_session("b", T_map_next, T_new_told)
+    for stamp_ns in range(4, 8):
+        T_local_base = se3.inverse(true[3]) @ true[stamp_ns]
+        atlas.add(stamp_ns, T_map_next @ T_local_base, "b" if stamp_ns > 4 else BRIDGED)
+        if stamp_ns > 4:
+            atlas.add_local(stamp_ns, T_local_base)
+    revised = Trajectory(stamps_ns=np.arange(5), T_world_base=true[:5])
+    atlas.close_session(first, MapLayers(), revised)
+    atlas.close_session(second, MapLayers(), Trajectory.empty())
+    np.testing.assert_allclose(atlas.trajectory.T_world_base, T_map_local @ true, atol=1e-9)
+    np.testing.assert_allclose(atlas.sessions[1].T_map_local, T_map_local @ true[3], atol=1e-9)
+
+
 def test_a_bridged_pose_moves_with_the_revised_pose_before_it():
     atlas = Atlas(voxel_m=0.05)
     session = add_session(atlas, "a", se3.identity(), [0, 1], [se3.identity()] * 2)

@@ -21,6 +21,7 @@ from sceneslam.atlas.revision import Revised, revise
 from sceneslam.atlas.submaps.correction import Correction
 from sceneslam.atlas.uncertainty import VELOCITY, Covariance, of_wheels
 from sceneslam.interfaces import TrajectoryLog
+from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError, InputError, text_of
 from sceneslam.types.maps import HybridMap, MapLayers
 from sceneslam.types.observation import Observation
@@ -177,11 +178,18 @@ class Atlas:
             self._journal.add_final(final.stamps_ns, final.T_new_old)
         self._correction, self._is_over = final, True
 
-    def begin_session(self, module: str, T_map_local: Transform) -> int:
-        """Open a session of a module placed at T_map_local (4, 4) (Eq. 1); return its number."""
+    def begin_session(
+        self, module: str, T_map_local: Transform, T_new_told: Transform | None = None
+    ) -> int:
+        """Open a session of a module placed at T_map_local (4, 4) (Eq. 1); return its number.
+
+        `T_new_told` (4, 4): how the module before it has corrected the last pose since that was
+        added; None: not at all.
+        """
+        T_new_told = se3.identity() if T_new_told is None else T_new_told
         if self._journal is not None:
-            self._journal.add_session(module, T_map_local)
-        self._sessions.append(OpenSession(module, T_map_local))
+            self._journal.add_session(module, T_map_local, T_new_told)
+        self._sessions.append(OpenSession(module, T_map_local, T_new_told))
         return len(self._sessions) - 1
 
     def add_local(self, stamp_ns: int, T_local_base: Transform) -> None:
@@ -383,5 +391,6 @@ class Atlas:
             self._sessions,
             np.array(self._path.stamps_ns, np.int64),
             np.array(self._path.poses).reshape(-1, 4, 4),
-            np.array(self._path.sessions, np.int64),
+            np.array(self._path.begun, np.int64),
+            np.array(self._path.modules) == BRIDGED,
         )

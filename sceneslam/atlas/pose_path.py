@@ -30,6 +30,7 @@ class OpenSession:
 
     module: str
     T_map_local: Transform
+    T_new_told: Transform = field(default_factory=se3.identity)  # of the pose before, at its start
     stamps_ns: array[int] = field(default_factory=lambda: array("q"))
     poses: Rows = field(default_factory=lambda: Rows(4, 4))  # T_local_base
     layers: MapLayers = field(default_factory=MapLayers)
@@ -61,6 +62,7 @@ class PosePath:
     stamps_ns: array[int] = field(default_factory=lambda: array("q"))
     poses: Rows = field(default_factory=lambda: Rows(4, 4))  # T_map_base
     modules: list[str] = field(default_factory=list)
+    begun: array[int] = field(default_factory=lambda: array("q"))  # the newest session then
     sessions: array[int] = field(
         default_factory=lambda: array("q")
     )  # its session, -1 before the first; bridged: the one before, until the new one answers
@@ -84,6 +86,7 @@ class PosePath:
         """
         if self.stamps_ns and stamp_ns <= self.stamps_ns[-1]:
             return
+        begun = session
         if module == BRIDGED and (not self.sessions or session != self.sessions[-1]):
             session = self.sessions[-1] if self.sessions else -1  # it begins with its first answer
         if map_covariance is None and len(self.poses) and session == self.sessions[-1]:
@@ -96,12 +99,13 @@ class PosePath:
         self.stamps_ns.append(stamp_ns)
         self.poses.append(T_map_base)
         self.modules.append(module)
+        self.begun.append(begun)
         self.sessions.append(session)
 
     def cut(self, stamp_ns: int) -> None:
         """Remove the poses from an instant on."""
         keep = bisect_left(self.stamps_ns, stamp_ns)
-        for values in (self.stamps_ns, self.modules, self.sessions):
+        for values in (self.stamps_ns, self.modules, self.begun, self.sessions):
             del values[keep:]
         for rows in (self.poses, self._covariances, self._maps):
             rows.cut(keep)

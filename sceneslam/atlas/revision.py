@@ -28,35 +28,40 @@ def revise(
     stamps_ns: NDArray[np.int64],
     T_map_base: NDArray[np.float64],
     pose_sessions: NDArray[np.int64],
+    is_bridged: NDArray[np.bool_],
 ) -> Revised:
-    """Return the poses after all revisions; `pose_sessions` (N,) is -1 before the first session.
+    """Return the poses after all revisions.
+
+    `pose_sessions` (N,): the newest session when a pose was added, -1 before the first.
 
     Every pose is corrected as the last revised pose of its session before it, so that bridged
-    motions do not change. A session starts where the revised session before it ended (Eq. 1), by
-    what was known of that one's map at the hand-over.
+    motions do not change. A session starts where the revised session before it ended (Eq. 1), less
+    the correction that was known at the hand-over.
     """
     moved = np.array(T_map_base)
     placed: list[Transform] = []
-    carried = se3.identity()  # correction of `map` at the session's start
+    carried, is_revised = se3.identity(), False  # correction of `map` at the last session's end
     for index, session in enumerate(sessions):
         rows = np.flatnonzero(pose_sessions == index)
-        T_map_local, corrections = _corrections(session, carried, stamps_ns[rows])
+        begun = carried @ se3.inverse(session.T_new_told) if is_revised else carried
+        T_map_local, corrections = _corrections(session, begun, stamps_ns[rows], is_bridged[rows])
         placed.append(T_map_local)
-        moved[rows] = corrections[:-1] @ moved[rows]
-        carried = corrections[-1] if len(rows) else carried
+        moved[rows] = corrections @ moved[rows]
+        if len(rows):
+            carried, is_revised = corrections[-1], len(session.revised) > 0
     return Revised(T_map_local=placed, T_map_base=moved)
 
 
 def _corrections(
-    session: OpenSession, carried: Transform, stamps_ns: NDArray[np.int64]
+    session: OpenSession,
+    carried: Transform,
+    stamps_ns: NDArray[np.int64],
+    is_bridged: NDArray[np.bool_],
 ) -> tuple[Transform, NDArray[np.float64]]:
-    """Return the revised T_map_local (4, 4), and T_new_told (N + 1, 4, 4) of poses in `map`.
-
-    The last one is of the module's last pose, which may be replaced since.
-    """
+    """Return the revised T_map_local (4, 4), and T_revised_told (N, 4, 4) of poses in `map`."""
     online, revised, T_map_local = session.online, session.revised, carried @ session.T_map_local
     if not len(revised):
-        return T_map_local, np.broadcast_to(carried, (len(stamps_ns) + 1, 4, 4))
+        return T_map_local, np.broadcast_to(carried, (len(stamps_ns), 4, 4))
     _, told_rows, revised_rows = np.intersect1d(
         online.stamps_ns, revised.stamps_ns, assume_unique=True, return_indices=True
     )
@@ -67,9 +72,10 @@ def _corrections(
     if len(told_rows) and told_rows[0] == 0 and not _is_identity(T_revised_told[0]):
         before = T_revised_told[0]
         T_map_local = T_map_local @ se3.inverse(before)
-    newest = np.searchsorted(online.stamps_ns[told_rows], stamps_ns, side="right")
-    newest = np.append(newest, len(told_rows))
-    T_revised_told = np.concatenate([before[None], T_revised_told])[newest]
+    told_ns = online.stamps_ns[told_rows]
+    is_kept = np.isin(told_ns, stamps_ns[~is_bridged])  # others were replaced
+    newest = np.searchsorted(told_ns[is_kept], stamps_ns, side="right")
+    T_revised_told = np.concatenate([before[None], T_revised_told[is_kept]])[newest]
     return T_map_local, T_map_local @ T_revised_told @ se3.inverse(session.T_map_local)
 
 

@@ -185,6 +185,7 @@ class Estimator:
 
     def _report(self, moment: BufferedObservation) -> None:
         """Report a pose to the back end."""
+        moment.T_new_told = se3.identity()
         if moment.T_map_base is not None:
             known = None if moment.module == BRIDGED else moment.tracking
             self._back_end.add(
@@ -204,23 +205,31 @@ class Estimator:
             self._back_end.rewind(trail[0].stamp_ns)
         from_ns = handover.tracked[0].stamp_ns
         posed_ns = min([from_ns, *(one.stamp_ns for one in trail if one.T_map_base is not None)])
-        self._begin_session(newest.stamp_ns, from_ns, posed_ns=posed_ns, jump=jump)
+        moved = handover.anchor.T_new_told
+        self._begin_session(newest.stamp_ns, from_ns, posed_ns=posed_ns, jump=jump, moved=moved)
         for tracking in handover.tracked:
             self._back_end.add_local(tracking.stamp_ns, tracking.T_local_base)
         self._put(trail, newest.stamp_ns)
         self.session.bridge = self._memory.newest.bridge.copy()
 
     def _begin_session(
-        self, stamp_ns: int, from_ns: int, *, posed_ns: int, jump: Transform
+        self,
+        stamp_ns: int,
+        from_ns: int,
+        *,
+        posed_ns: int,
+        jump: Transform,
+        moved: Transform | None = None,
     ) -> None:
         """Open the active module's session in the back end; it begins at `from_ns`.
 
         Its first pose, bridged or not, has the stamp `posed_ns`.
-        `jump` is the transform from the pose reported at `stamp_ns` to the corrected one.
+        `jump` is the transform from the pose reported at `stamp_ns` to the corrected one,
+        `moved` the correction T_new_told of the pose from which it begins.
         """
         assert self.active is not None and self.active.T_map_local is not None
         T_map_local, last_ns = self.active.T_map_local, self._back_end.last_stamp_ns
-        session = self._back_end.begin_session(self.active.key, T_map_local)
+        session = self._back_end.begin_session(self.active.key, T_map_local, moved)
         self.session.stored.append(session)
         self._log.add(
             "handover",

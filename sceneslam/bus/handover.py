@@ -38,7 +38,8 @@ class Handover:
         pace: Pace,
     ) -> None:
         assert session.runner is not None
-        self.session, self.runner, self.anchor = session, session.runner, anchor
+        self.session, self.runner = session, session.runner
+        self.anchor = replace(anchor)  # the memory may remove it
         self.trail: list[BufferedObservation] = []  # after the anchor; with it, if it is bridged
         self.tracked: list[Tracking] = []  # its answers from the anchor on, while it tracks
         self._pace, self._memory = pace, memory
@@ -116,7 +117,7 @@ class Handover:
         session.bridge = session.bridge.moved(T_new_old)
         if self._reported is not None:
             self._reported = T_new_old @ self._reported
-        for moment in self.trail:
+        for moment in [self.anchor, *self.trail]:
             moment.move(T_new_old)
         if session.is_placed:
             assert self.runner.T_map_local is not None
@@ -135,7 +136,7 @@ class Handover:
         session, motion = self.session, self._motion_to(moment)
         self._done_ns, self._reported = moment.stamp_ns, moment.T_map_base
         if not session.is_placed and moment.is_trusted:
-            self.anchor, self.trail, session.bridge = moment, [], moment.bridge.copy()
+            self.anchor, self.trail, session.bridge = replace(moment), [], moment.bridge.copy()
         is_newest = moment is self._memory.newest
         is_tracking = session.is_placed and session.hold.is_held
         is_given = is_newest or not is_tracking or not self._pace.spares(moment.observation)
@@ -172,7 +173,7 @@ class Handover:
                 T_bridged_base = se3.inverse(T_map_bridged) @ found.T_map_base
                 self._bend(session.tracking, T_bridged_base)
             self._spared_ns, self._given_ns = [], moment.stamp_ns
-        if moment is not self.anchor or moment.module == BRIDGED:
+        if moment.stamp_ns != self.anchor.stamp_ns or moment.module == BRIDGED:
             found.observation = bare(given)  # the memory bounds what is kept of it
             self.trail.append(found)
         if session.hold.suspect_since_ns is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from operator import attrgetter
 
 import numpy as np
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from sceneslam.bus.bridge import Bridge
 from sceneslam.bus.judging.gate import Witness
+from sceneslam.types import se3
 from sceneslam.types.observation import Observation, Tracking
 from sceneslam.types.run import BRIDGED
 from sceneslam.types.se3 import Transform
@@ -33,6 +34,7 @@ class BufferedObservation:
     is_trusted: bool  # a module that was not suspect was tracking, as certain as usual
     vouches: bool = False  # then: it measures without wheels, and moved as they and the gyro say
     missed_rad: float | None = None  # yaw by wheels alone since the start, less the gyro's
+    T_new_told: Transform = field(default_factory=se3.identity)  # corrections since it was reported
 
     @property
     def stamp_ns(self) -> int:
@@ -48,7 +50,7 @@ class BufferedObservation:
         """Move the pose by the correction (4, 4) of the map."""
         if self.T_map_base is not None:
             self.T_map_base = T_new_old @ self.T_map_base
-        self.bridge = self.bridge.moved(T_new_old)
+        self.bridge, self.T_new_told = self.bridge.moved(T_new_old), T_new_old @ self.T_new_told
 
 
 def bridged(

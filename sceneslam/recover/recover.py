@@ -97,8 +97,8 @@ class _Retold:
     def add_observation(self, stamp_ns: int) -> None:
         self._atlas.report(stamp_ns)
 
-    def add_session(self, module: str, T_map_local: Transform) -> None:
-        self._atlas.begin_session(module, T_map_local)
+    def add_session(self, module: str, T_map_local: Transform, T_new_told: Transform) -> None:
+        self._atlas.begin_session(module, T_map_local, T_new_told)
 
     def add_local(self, stamp_ns: int, T_local_base: Transform) -> None:
         self._atlas.add_local(stamp_ns, T_local_base)

@@ -7,7 +7,7 @@
 |---|---|
 | `H` | JSON: what the results need beside the configuration (`JournalHeader`) |
 | `O` | stamp [ns] of an observation; its pose is reported as it is now |
-| `S` | T_map_local of a new session, key of its module |
+| `S` | T_map_local and T_new_told of a new session, key of its module |
 | `L` | stamp, T_local_base of the session |
 | `P` | stamp, T_map_base, two covariances (each a byte 1 and 21 numbers, or a byte 0), its module |
 | `R` | stamp from which on poses are taken back |
@@ -41,7 +41,7 @@ from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import Trajectory
 
 JOURNAL = "journal.bin"
-MAGIC = b"SceneSLAM journal 4\n"
+MAGIC = b"SceneSLAM journal 5\n"
 _HEAD = struct.Struct("<cII")
 _STAMP = struct.Struct("<q")
 _POSE_BYTES = 12 * 8
@@ -80,9 +80,9 @@ class Journal:
         """Record that an observation was processed, and its pose reported."""
         self._add(b"O", _STAMP.pack(stamp_ns))
 
-    def add_session(self, module: str, T_map_local: Transform) -> None:
+    def add_session(self, module: str, T_map_local: Transform, T_new_told: Transform) -> None:
         """Record that a session begins."""
-        self._add(b"S", _pose(T_map_local) + module.encode())
+        self._add(b"S", _pose(T_map_local) + _pose(T_new_told) + module.encode())
 
     def add_local(self, stamp_ns: int, T_local_base: Transform) -> None:
         """Record a pose of the session's trajectory, T_local_base (4, 4) [m]."""
@@ -194,7 +194,8 @@ def _records(data: bytes) -> Iterator[tuple[bytes, bytes]]:
 
 
 def _tell_session(log: TrajectoryLog, body: bytes) -> None:
-    log.add_session(body[_POSE_BYTES:].decode(), _transform(body))
+    module = body[2 * _POSE_BYTES :].decode()
+    log.add_session(module, _transform(body), _transform(body[_POSE_BYTES:]))
 
 
 def _tell_local(log: TrajectoryLog, body: bytes) -> None:
