@@ -132,6 +132,11 @@ SURVEYS = {  # sensor -> what is plausible, what is not, what is said of it
         {"gyro_radps": [np.array([0.0, 0.0, 172.0])]},
         "172 rad/s are implausible; is its unit degrees?",
     ),
+    Sensor.ACCELEROMETER: (
+        {"forces_mps2": [np.array([0.5, 0.0, 9.6]), np.array([0.0, 0.0, 30.0]), np.ones(3) * 5]},
+        {"forces_mps2": [np.array([0.0, 0.0, 1.0])]},
+        "an acceleration of 1 m/s^2 in the median is implausible, as gravity is 9.81; is its unit",
+    ),
 }
 
 

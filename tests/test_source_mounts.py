@@ -250,6 +250,7 @@ def test_gyro_and_accelerometer_may_come_in_messages_of_their_own(tmp_path: Path
     assert sum(len(one.accelerometer_base) for one in source) == 20
     survey = source.survey()
     np.testing.assert_allclose(survey.gyro_radps[0], samples[Sensor.GYRO])
+    np.testing.assert_allclose(survey.forces_mps2[0], samples[Sensor.ACCELEROMETER])
     assert survey.stream(Sensor.GYRO).rate_hz == pytest.approx(100.0)
 
 

@@ -75,6 +75,7 @@ def survey_recording(
         odometry_ns=np.array(samples.odometry_ns, np.int64),
         T_odom_base=samples.T_odom_base,
         gyro_radps=samples.gyro_radps,
+        forces_mps2=samples.forces_mps2,
         unplaced=unplaced,
         silent=silent,
         odd=[
@@ -130,6 +131,7 @@ class _Samples:
         self.odometry_ns: list[int] = []
         self.T_odom_base: list[Any] = []
         self.gyro_radps: list[Any] = []
+        self.forces_mps2: list[Any] = []
 
     def begin(self) -> None:
         """Begin a time span."""
@@ -149,6 +151,8 @@ class _Samples:
             self.T_odom_base.append(held)
         elif sensor is Sensor.GYRO:
             self.gyro_radps.append(held)
+        elif sensor is Sensor.ACCELEROMETER:
+            self.forces_mps2.append(held)
         elif self._counts.get(sensor, 0) < _MOST_SAMPLES:
             self._counts[sensor] = self._counts.get(sensor, 0) + 1
             self._decode(sensor, stamp_ns, value)

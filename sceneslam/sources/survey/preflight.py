@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from sceneslam.sources.contract.odometer import SPEED_MAX_MPS
 from sceneslam.sources.survey.survey import Stream, Survey
-from sceneslam.types.rig import Camera, Rig, Sensor
+from sceneslam.types.rig import GRAVITY, Camera, Rig, Sensor
 
 _IN_RANGE_MIN = 0.9  # share of depths in range; with wrong units, at most 0.74 in our recordings
 _SCALES = (1000.0, 5000.0)  # units per metre in use: millimetres, and those of TUM
@@ -23,6 +23,7 @@ _FITS = 0.98  # share of depths in range that confirms a scale
 _FIELD_OF_VIEW_DEG = (15.0, 150.0)  # of a pinhole camera, horizontal
 _OFF_CENTRE = 0.25  # of the image's size; a principal point is within some per cent of the centre
 _TURN_MAX_RADPS = 35.0  # gyros measure up to 2000 degrees per second
+_FORCE_FACTOR = 2.0  # of the median force, which is gravity's: a robot rests or drives evenly
 _RETURNS_MIN = 0.02  # share of beams with a return; less in open fields only
 CLOCKS_APART_S = 1.0  # drivers deliver earlier; TAI, which PTP has, is 37 s ahead of UTC
 _IMAGE_RATE_HZ = (0.5, 2000.0)  # below, images do not overlap; above, the stamps' unit is wrong
@@ -210,7 +211,7 @@ def _of_ranges(survey: Survey, rig: Rig) -> Iterator[str]:
 
 
 def _of_motion(survey: Survey) -> Iterator[str]:
-    """Yield warnings of odometry and gyros that are faster than any robot."""
+    """Yield warnings of odometry and gyros faster than any robot, and of forces unlike gravity."""
     if survey.odometry_ns is not None and len(survey.T_odom_base) > 1:
         positions_m = np.stack([T[:3, 3] for T in survey.T_odom_base])
         steps_s = np.diff(survey.odometry_ns) * 1e-9
@@ -225,6 +226,14 @@ def _of_motion(survey: Survey) -> Iterator[str]:
         if turn > _TURN_MAX_RADPS:
             place = getattr(survey.stream(Sensor.GYRO), "place", "")
             yield f"{place}: {turn:.3g} rad/s are implausible; is its unit degrees?"
+    if len(survey.forces_mps2):
+        force = float(np.median(np.linalg.norm(np.stack(survey.forces_mps2), axis=1)))
+        if not GRAVITY / _FORCE_FACTOR < force < GRAVITY * _FORCE_FACTOR:  # also for NaN
+            place = getattr(survey.stream(Sensor.ACCELEROMETER), "place", "")
+            yield (
+                f"{place}: an acceleration of {force:.3g} m/s^2 in the median is implausible, as "
+                f"gravity is {GRAVITY:g}; is its unit g, or gravity removed?"
+            )
 
 
 def _of_places(survey: Survey) -> Iterator[str]:

@@ -57,6 +57,7 @@ class Survey:
     odometry_ns: Stamps | None = None  # (N,) stamps of ...
     T_odom_base: Sequence[Transform] = ()  # ... these N poses
     gyro_radps: Sequence[NDArray[np.float64]] = ()  # (3,) each
+    forces_mps2: Sequence[NDArray[np.float64]] = ()  # (3,) each, of the accelerometer
     unplaced: Sequence[str] = ()  # frames of sensors that no transform connects with the base
     odd: Sequence[str] = ()  # sentences about who publishes, and what is assumed
     silent: Sequence[str] = ()  # announced topics without a message
