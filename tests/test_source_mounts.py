@@ -230,6 +230,27 @@ def test_points_of_an_optical_frame_without_transforms_look_ahead(
     np.testing.assert_array_equal(source.rig.lidar.T_base_lidar, T_base_lidar)
 
 
+@pytest.mark.parametrize(
+    ("frame", "T_base_cam", "is_odd"),
+    [
+        ("camera_link", se3.identity(), True),
+        ("camera_link", se3.exp(np.array([0.2, 0.0, 0.3, 0.0, 0.6, 0.0])), True),  # tilted
+        ("camera_link", optical_to_rep103(), False),
+        ("ceiling_optical", se3.identity(), False),
+    ],
+)
+def test_a_camera_in_the_frame_of_its_body_is_named(
+    tmp_path: Path, frame: str, T_base_cam: np.ndarray, is_odd: bool
+) -> None:
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    data = Encoder().transforms(STAMP_NS, "base_link", {frame: T_base_cam})
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        recorder.add("/tf_static", 0, store.deserialize_cdr(data, "tf2_msgs/msg/TFMessage"))
+        recorder.image("/rgb", STAMP_NS, COLOR, frame=frame)
+    odd = make_source("mcap", tmp_path / "a.mcap").survey().odd
+    assert ["frame 'camera_link' looks up" in one for one in odd] == [True] * is_odd
+
+
 def test_gyro_and_accelerometer_may_come_in_messages_of_their_own(tmp_path: Path) -> None:
     store = get_typestore(Stores.ROS2_HUMBLE)
     samples = {

@@ -21,6 +21,7 @@ from sceneslam.sources.bag.rig import (
     sensor_topics,
     unplaced,
     unregistered,
+    upward,
 )
 from sceneslam.sources.bag.stamps import StampReader
 from sceneslam.sources.bag.synchronise import Sample, SynchronisedSamples, Synchroniser
@@ -155,8 +156,9 @@ class RosBag:
         return [] if self._frames.is_empty and len(found) == 1 else found
 
     def _assumed(self) -> Iterator[str]:
-        """Yield sentences on what is assumed of depth and ground truth."""
+        """Yield sentences on what is assumed of depth, camera and ground truth."""
         yield from unregistered(self._recording, self._topics, self._frames)
+        yield from upward(self._recording, self._topics, self._frames)
         if self._truth_frame is None:
             yield from unplaced_body(self._recording, self._topics, self._frames)
 

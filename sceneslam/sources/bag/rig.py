@@ -32,6 +32,7 @@ _NEEDS = {  # sensor -> field of BagTopics that names its topic
 }
 # Topics of image_proc and of other drivers, such as image_rect_color and image_color_rect.
 _RECTIFIED = re.compile(r"image_rect|(^|[/_])rect(?=[/_]|$)")
+_UPWARD = 0.7  # cosine between a camera's axis and up: its body is tilted by less than 45 degrees
 _DEPTH_RANGE_M, _LIDAR_RANGE_M = (0.3, 8.0), (1.0, 100.0)
 
 
@@ -122,6 +123,19 @@ def unregistered(recording: Recording, topics: BagTopics, frames: FrameTree) -> 
         yield (
             f"{topics.depth} (frame {seen_in[1]!r}) has another lens or position than "
             f"{topics.image} (frame {seen_in[0]!r}): depth has to be registered to the images"
+        )
+
+
+def upward(recording: Recording, topics: BagTopics, frames: FrameTree) -> Iterator[str]:
+    """Yield a sentence if the camera looks up by its transform, as in the frame of its body."""
+    topic = topics.image or topics.depth
+    message = first(recording, topic) if topic else None
+    frame = "" if message is None else decode.frame_id(message)
+    T_base_cam = frames.T_base(frame)
+    if T_base_cam is not None and T_base_cam[2, 2] > _UPWARD and "optical" not in frame:
+        yield (
+            f"{topic}: by its transform, the camera of frame {frame!r} looks up; is this the frame "
+            "of its body (x ahead), and not its optical frame (z ahead)?"
         )
 
 

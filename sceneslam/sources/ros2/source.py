@@ -20,6 +20,7 @@ from sceneslam.sources.bag.rig import (
     sensor_topics,
     unplaced,
     unregistered,
+    upward,
 )
 from sceneslam.sources.bag.synchronise import Sample, SynchronisedSamples, Synchroniser
 from sceneslam.sources.bag.topics import NONE, TYPES, choose_topics
@@ -134,6 +135,7 @@ class Ros2(Measuring):
             odd=[
                 *oddities(self.heard, [name for name in self._named.values() if name]),
                 *unregistered(self.heard, self.topics, self.frames),
+                *upward(self.heard, self.topics, self.frames),
                 *odometry_oddities(self.heard, self.topics.odometry, self.frames),
             ],
         )
