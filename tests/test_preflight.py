@@ -166,6 +166,27 @@ def test_sensors_without_a_common_time_are_noticed():
 
 
 @pytest.mark.parametrize(
+    ("period_s", "silent_after_s", "said"),
+    [
+        (0.8, 1.0, "about 88% of its messages lie between those of /image"),
+        (0.8, None, ""),  # each sensor has observations of its own
+        (0.15, 1.0, ""),
+        (1.9, 1.0, ""),  # the lidar sets the pace half of the time
+        (1.6, 1.0, "about 56%"),
+    ],
+)
+def test_clouds_between_images_of_a_slow_camera_are_noticed(period_s, silent_after_s, said):
+    times_ns = np.arange(10, dtype=np.int64)
+    image = replace(stream(Sensor.IMAGE, times_ns * round(period_s * 1e9)), place="/image")
+    survey = Survey(
+        streams=[image, stream(Sensor.POINTS, times_ns * 10**8)], silent_after_s=silent_after_s
+    )
+    found = preflight(survey, Rig(sensors=frozenset({Sensor.IMAGE, Sensor.POINTS}))).warnings
+    assert len(found) == bool(said)
+    assert all(said in one and "source.topics.image=none uses them" in one for one in found)
+
+
+@pytest.mark.parametrize(
     ("delay_s", "said"),
     [(0.4, ""), (None, ""), (-36.95, "37.0 s ahead of"), (37.05, "37.0 s behind")],
 )
@@ -202,7 +223,12 @@ def sampled(path, times_s, *, is_slow, tolerance_s=0.02):
     recording.is_slow = is_slow  # as a bag that bzip2 packed
     topics = {sensor: topic for sensor, topic in STREAMS.items() if topic in times_s}
     return survey_recording(
-        recording, topics, depth_scale=1000.0, sync_tolerance_s=tolerance_s, mounts=MOUNTS
+        recording,
+        topics,
+        depth_scale=1000.0,
+        sync_tolerance_s=tolerance_s,
+        silent_after_s=1.0,
+        mounts=MOUNTS,
     )
 
 

@@ -141,6 +141,7 @@ class RosBag:
             {sensor: self._by_sensor[sensor] for sensor in Sensor if sensor in self._by_sensor},
             depth_scale=self._depth_scale,
             sync_tolerance_s=self._sync_tolerance_s,
+            silent_after_s=self._silent_after_s,
             mounts=self._mounts,
             unplaced=self._unplaced(),
             odd=list(self._assumed()),

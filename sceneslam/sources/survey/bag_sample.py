@@ -29,6 +29,7 @@ def survey_recording(
     *,
     depth_scale: float,
     sync_tolerance_s: float,
+    silent_after_s: float,
     mounts: Mounts,
     unplaced: Sequence[str] = (),
     silent: Sequence[str] = (),
@@ -68,6 +69,7 @@ def survey_recording(
     return Survey(
         streams=streams,
         sync_tolerance_s=sync_tolerance_s,
+        silent_after_s=silent_after_s,
         depth_scale=depth_scale if samples.is_scaled else None,
         depths_m=samples.depths_m,
         scans=samples.scans,

@@ -13,6 +13,7 @@ from math import atan, degrees
 import numpy as np
 from numpy.typing import NDArray
 
+from sceneslam.sources.bag.observation import PRIMARY
 from sceneslam.sources.contract.odometer import SPEED_MAX_MPS
 from sceneslam.sources.survey.survey import Stream, Survey
 from sceneslam.types.rig import GRAVITY, Camera, Rig, Sensor
@@ -25,6 +26,7 @@ _OFF_CENTRE = 0.25  # of the image's size; a principal point is within some per 
 _TURN_MAX_RADPS = 35.0  # gyros measure up to 2000 degrees per second
 _FORCE_FACTOR = 2.0  # of the median force, which is gravity's: a robot rests or drives evenly
 _RETURNS_MIN = 0.02  # share of beams with a return; less in open fields only
+_UNUSED_MAX = 0.5  # share of scans: with fewer unused ones, every second is used
 CLOCKS_APART_S = 1.0  # drivers deliver earlier; TAI, which PTP has, is 37 s ahead of UTC
 _IMAGE_RATE_HZ = (0.5, 2000.0)  # below, images do not overlap; above, the stamps' unit is wrong
 
@@ -40,7 +42,7 @@ class Preflight:
 def preflight(survey: Survey, rig: Rig) -> Preflight:
     """Return the report: a survey compared with the rig that the source declares."""
     camera = rig.camera
-    warnings = [*_of_time(survey), *_of_pairs(survey)]
+    warnings = [*_of_time(survey), *_of_pace(survey), *_of_pairs(survey)]
     if camera is not None:
         warnings += [*_of_lens(camera), *_of_depth(survey, camera)]
     warnings += [*_of_ranges(survey, rig), *_of_motion(survey), *_of_places(survey)]
@@ -111,6 +113,28 @@ def _of_time(survey: Survey) -> Iterator[str]:
 def _spans(survey: Survey) -> str:
     spans = ((one, one.stamps_ns[[0, -1]] * 1e-9) for one in survey.streams if len(one.stamps_ns))
     return ", ".join(f"{one.place} {first:.3f} to {last:.3f} s" for one, (first, last) in spans)
+
+
+def _of_pace(survey: Survey) -> Iterator[str]:
+    """Yield warnings of scans and clouds most of which come between two observations.
+
+    An observation has the last one before its image; while images are silent, each has its own.
+    """
+    ranked = [one for sensor in PRIMARY if (one := survey.stream(sensor)) is not None]
+    pace_hz = ranked[0].rate_hz if ranked else None
+    if pace_hz is None or survey.silent_after_s is None:
+        return
+    paced_ratio = min(1.0, survey.silent_after_s * pace_hz)
+    for place, stream in enumerate(ranked[1:], start=1):
+        if stream.sensor not in (Sensor.SCAN, Sensor.POINTS) or stream.rate_hz is None:
+            continue
+        unused = paced_ratio - pace_hz / stream.rate_hz
+        if unused > _UNUSED_MAX:
+            keys = " ".join(f"source.topics.{one.sensor.value}=none" for one in ranked[:place])
+            yield (
+                f"{stream.place}: about {unused:.0%} of its messages lie between those of "
+                f"{ranked[0].place} and are not used: {keys} uses them"
+            )
 
 
 def _of_pairs(survey: Survey) -> Iterator[str]:

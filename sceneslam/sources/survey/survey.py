@@ -49,6 +49,7 @@ class Survey:
 
     streams: Sequence[Stream]
     sync_tolerance_s: float | None = None  # between an image and its depth
+    silent_after_s: float | None = None  # then another sensor sets the pace; None: each has its own
     depth_scale: float | None = None  # units per metre; None where depth is stored in metres
     assumed_camera: str = ""  # whose intrinsics were assumed, "" where they are the recording's own
     depths_m: Sequence[NDArray[np.float32]] = ()  # (H, W), also out of range; 0 = missing
