@@ -16,7 +16,7 @@ from typing import Any, cast
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException, OverrideParseException
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
@@ -138,11 +138,20 @@ def _said(error: Exception) -> str:
     """Return a sentence on an error before the first job, in terms of the command line."""
     if isinstance(error, OverrideParseException):
         return how_to_quote(error.override, str(error).removeprefix(f"{error.override}: "))
+    if isinstance(error, MissingConfigException) and error.options:
+        return _without_paths(error, error.options)
     if isinstance(error, HydraException):
         return _without_advice(error)
     if isinstance(error, SceneSlamError | OmegaConfBaseException | YAMLError):
         return str(error)
     return _meant(error) or f"the configuration cannot be composed: {shortened(text_of(error))}"
+
+
+def _without_paths(error: MissingConfigException, options: Sequence[str]) -> str:
+    """Return Hydra's message on an option that does not exist without the paths it looked in."""
+    group = re.findall(r"Available options in '(.+)':", str(error))[0]
+    name = str(error.missing_cfg_file).removeprefix(f"{group}/")
+    return str(ConfigError(group, name, f"one of: {', '.join(options)}"))
 
 
 def _without_advice(error: HydraException) -> str:

@@ -1,12 +1,24 @@
 """A scenario in a user's own folder: it runs as the guide has it, and mistakes are named by key."""
 
 import json
+import re
 
 import pytest
 from documentation import ROOT, run_inside, write_files, write_recordings
 
 GUIDE = ROOT / "docs" / "own_scenario.md"
 RUN = "python -m sceneslam --config-dir my_robots +scenario=depot"
+TABLE = dict(
+    re.findall(r"^\| `(.+?)` \| `(error: .+)` \|$", GUIDE.read_text().replace(r"\|", "|"), re.M)
+)
+MISTAKES = {  # what the table has in the file -> the file, and what it has in the guide
+    "treshold: 70.0": ("detector/hall_or_tunnel", "threshold: 70.0"),
+    "scenes: [Hall, Tunel]": ("detector/hall_or_tunnel", "scenes: [Hall, Tunnel]"),
+    "Hall: [eye, laser]": ("scenario/depot", "Hall: [eyes, laser, wheels]"),
+    "handover: worm": ("policy/careful", "handover: warm"),
+    "size_wh: [424]": ("source/depot_robot", "size_wh: [424, 240]"),
+    "override /source: depot_robo": ("scenario/depot", "override /source: depot_robot"),
+}
 
 
 @pytest.fixture
@@ -32,23 +44,17 @@ def test_robot_of_the_guide_is_driven_by_its_three_modules_and_policy(folder, ca
 @pytest.mark.parametrize(
     ("file", "right", "wrong", "told"),
     [
-        ("detector/hall_or_tunnel", "threshold", "treshold", "detector.treshold: got 70.0"),
-        ("detector/hall_or_tunnel", "Tunnel]", "Tunel]", "scenes.Tunel: got nothing"),
         ("detector/hall_or_tunnel", "- grey_mean", "- gray_mean", "detector/gray_mean"),
-        ("scenario/depot", "[eyes,", "[eye,", "scenes.Hall: got ['eye', 'laser', 'wheels']"),
         ("scenario/depot", "[laser, wheels]", "laser", "scenes.Tunnel: got 'laser'"),
         ("scenario/depot", "\n  laser:\n", "\n  lasr:\n", "slam.lasr: got {'range_max_m': 6.0}"),
         ("scenario/depot", "range_max_m", "range_max", "slam.laser.range_max: got 6.0"),
-        ("scenario/depot", "wheels: odometry", "wheels: odometer", "slam/odometer"),
+        ("scenario/depot", "wheels: odometry", "wheels: odometer", "slam: got 'odometer'"),
         ("scenario/depot", "slam@slam.eyes", "slam@slm.eyes", "did you mean slam?"),
         ("scenario/depot", "\nscenes:", "\nscene:", "did you mean scenes?"),
-        ("scenario/depot", "source: depot_robot", "source: depot_robo", "source/depot_robo"),
         ("scenario/depot", "# @package _global_", "# ours", "source@scenario.source"),
-        ("policy/careful", "warm", "worm", "policy.handover: got 'worm'"),
         ("policy/careful", "retry_s", "retr_s", "policy.retr_s: got 3.0"),
         ("policy/careful", "3.0", "three", "policy.retry_s: got 'three', allowed: a number"),
         ("source/depot_robot", "  fov_deg: 75", "  fov: 75", "source.camera.fov: got 75.0"),
-        ("source/depot_robot", "[424, 240]", "[424]", "source.camera.size_wh: got [424]"),
         ("source/depot_robot", "laser: true", "laser: perhaps", "source.laser: got 'perhaps'"),
         ("source/depot_robot", "  fov_deg: 180", " fov_deg: 180", "depot_robot.yaml"),
     ],
@@ -56,15 +62,29 @@ def test_robot_of_the_guide_is_driven_by_its_three_modules_and_policy(folder, ca
 def test_mistake_in_a_file_of_the_user_is_one_sentence_that_names_it(
     folder, capfd, file, right, wrong, told
 ):
+    assert told in read(folder, capfd, file, right, wrong)
+
+
+@pytest.mark.parametrize(("wrong", "told"), TABLE.items())
+def test_mistake_in_the_table_of_the_guide_is_answered_as_it_says(folder, capfd, wrong, told):
+    assert read(folder, capfd, *MISTAKES[wrong], wrong) == told
+
+
+def test_every_row_of_the_table_is_tried():
+    assert TABLE.keys() == MISTAKES.keys()
+
+
+def read(folder, capfd, file, right, wrong):
+    """Return what is read when a mistake is made in a file of the guide."""
     path = folder / "my_robots" / f"{file}.yaml"
     before = path.read_text()
     assert right in before
     path.write_text(before.replace(right, wrong, 1))
     assert run_inside(f"{RUN} source.cache_dir=cache") == 2
     said, errors = capfd.readouterr()
-    assert told in errors, errors
     assert errors.startswith("error: ") and "Traceback" not in errors
     assert not said and not (folder / "cache").exists()
+    return errors.strip()
 
 
 def test_real_robot_takes_the_place_of_the_simulated_one(folder, capfd):
