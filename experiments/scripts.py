@@ -21,10 +21,14 @@ CONF = Path(__file__).resolve().parents[1] / "conf"
 
 
 def run(folder: Path, *overrides: str) -> Path:
-    """Run SceneSLAM into a folder, and return that; its own lines go to standard error."""
+    """Run SceneSLAM into a folder, and return that; its own lines go to standard error.
+
+    Where it fails, its last line says why, and the script ends with its exit code.
+    """
     command = [sys.executable, "-m", "sceneslam", *overrides, f"hydra.run.dir={folder}"]
     print(" ".join(command[1:]), file=sys.stderr)
-    subprocess.run(command, stdout=sys.stderr, check=True)
+    if code := subprocess.run(command, stdout=sys.stderr).returncode:
+        sys.exit(code)
     return folder
 
 
