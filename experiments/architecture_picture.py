@@ -12,6 +12,7 @@ import ast
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
+import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -20,6 +21,7 @@ COLORS = {"sceneslam": "#d9e8f5", "modules": "#f7dcc8", "experiments": "#d8efe4"
 APP = ("app", "loop", "keeping", "results", "experiment")  # files that carry a run out: one box
 SINGLE = ("interfaces", "cli", "script")  # files with a box of their own
 WIDTH_IN, LAYER_IN = 10.0, 0.95
+BENDS = sorted(np.linspace(-0.4, 0.4, 17), key=abs)  # of arrows, the straightest first
 Imports = Mapping[str, set[str]]  # package -> the packages that it imports
 
 
@@ -90,6 +92,22 @@ def direct(found: Imports, height: Mapping[str, int]) -> list[tuple[str, str]]:
     return arrows
 
 
+def bend(package: str, other: str, place: Mapping[str, tuple[float, float]]) -> float:
+    """Return the bend of an arrow (matplotlib's arc3) that hides least of it behind boxes."""
+    gap = np.array([0.0, 0.19])
+    start, end = place[package] - gap, place[other] + gap
+    share = np.linspace(0.0, 1.0, 50)[:, np.newaxis]
+    boxes = [(np.array(at), 0.2 + 0.05 * len(one)) for one, at in place.items()]  # half as wide
+
+    def hidden(rad: float) -> int:
+        middle = (start + end) / 2 + rad * np.array([1.0, -1.0]) * (end - start)[::-1]
+        line = (1 - share) ** 2 * start + 2 * share * (1 - share) * middle + share**2 * end
+        off = [np.abs(line - at) < (half, 0.18) for at, half in boxes]
+        return sum(int(np.all(one, axis=1).sum()) for one in off)
+
+    return float(min(BENDS, key=hidden))
+
+
 def draw(path: Path) -> None:
     """Write the picture."""
     found = imports()
@@ -111,7 +129,12 @@ def draw(path: Path) -> None:
             "",
             xy=(place[other][0], place[other][1] + 0.19),
             xytext=(place[package][0], place[package][1] - 0.19),
-            arrowprops={"arrowstyle": "-|>", "color": "#9aa0a6", "linewidth": 1.0},
+            arrowprops={
+                "arrowstyle": "-|>",
+                "color": "#9aa0a6",
+                "linewidth": 1.0,
+                "connectionstyle": f"arc3,rad={bend(package, other, place)}",
+            },
             zorder=1,
         )
     for package, (x, y) in place.items():
