@@ -23,6 +23,7 @@ def leave_threads(code: int) -> None:
 
 
 def _watch(threads: list[threading.Thread], code: int) -> None:
+    threading.main_thread().join()  # a program that called ours may go on
     sleep(_PATIENCE_S)
     left = [one.name for one in threads if one.is_alive() and one is not threading.main_thread()]
     if not left:

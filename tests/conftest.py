@@ -11,6 +11,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as `python -m sceneslam` s
 import hypothesis
 import pytest
 
+from sceneslam import leaving
 from sceneslam.ros.writer import ObservationWriter
 from sceneslam.testing.room import RIG, room_observation
 
@@ -31,6 +32,14 @@ def own_logging() -> Iterator[None]:
         handler.close()
     root.handlers[:] = handlers
     root.setLevel(level)
+
+
+@pytest.fixture(autouse=True, scope="session")
+def own_end() -> Iterator[None]:
+    """Let no command that ran inside the tests' process end that with its own exit code."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(leaving, "_watch", lambda threads, code: None)
+        yield
 
 
 @pytest.fixture
