@@ -114,6 +114,28 @@ def test_odometry_that_is_missing_once_is_no_lie():
     assert drive.model.lying == pytest.approx(before, abs=0.01)
 
 
+def test_lies_are_found_though_learning_is_often_interrupted():
+    drive = Drive(period_s=1 / 30)
+    for index in range(300):
+        drive.step(factor=1.0 if index < 150 else 0.0, teaches=index % 3 > 0)
+        if index % 3 == 0:
+            drive.model.skip()
+    assert drive.model.lying[0] > 0.9
+
+
+def test_noise_between_poses_hides_no_lie():
+    drive, T_true, T_seen = Drive(period_s=1 / 30), se3.identity(), se3.identity()
+    deviation = np.array([0.01] * 3 + [0.005] * 3)
+    for index in range(180):
+        drive.step(speed=1.0, factor=1.0 if index < 90 else 2.0, teaches=False)
+        T_true = T_true @ se3.from_xy_yaw(1.0 / 30, 0.0, 0.2 / 30)
+        T_before, T_seen = T_seen, T_true @ se3.exp(deviation * drive.rng.standard_normal(6))
+        drive.model.learn(se3.inverse(T_before) @ T_seen, 2.0 * np.diag(deviation**2))
+        if index == 89:
+            assert drive.model.lying[0] < 0.05
+    assert drive.model.lying[0] > 0.9
+
+
 @pytest.mark.parametrize("factor", [-1.0, 0.0, 2.0])
 def test_lying_wheels_are_found_out_and_believed_again(factor):
     drive = Drive()

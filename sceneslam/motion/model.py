@@ -169,16 +169,18 @@ class MotionModel:
         )
         self._forget()
         if wheels is None:
-            self._compared = None
+            self._compare()
             return
         compared = Compared(duration_s, T_before_now, covariance, wheels)
         self._compared = compared if self._compared is None else self._compared.then(compared)
         if self._compared.duration_s >= _COMPARED_S:
-            self._compare(self._compared)
-            self._compared = None
+            self._compare()
 
-    def _compare(self, compared: Compared) -> None:
-        """Calibrate the wheels by a measured motion."""
+    def _compare(self) -> None:
+        """Calibrate the wheels by the motion that was measured since the last comparison."""
+        compared, self._compared = self._compared, None
+        if compared is None:
+            return
         wheels = compared.wheels
         off = se3.log(se3.inverse(wheels.T) @ compared.T)[_PLANAR]
         measured = compared.covariance[np.ix_(_PLANAR, _PLANAR)]
@@ -226,13 +228,15 @@ class MotionModel:
     def skip(self) -> None:
         """Discard the motion since the last call, which no sensor measured."""
         self._forget()
-        self._compared, self._is_followed = None, True
+        self._compare()
+        self._is_followed = True
 
     def stop(self) -> None:
         """Reset velocity and odometry: the base is no longer tracked."""
         self.inertia.reset()
         self._forget()
-        self._since_wheels, self._compared, self._is_followed = None, None, False
+        self._compare()
+        self._since_wheels, self._is_followed = None, False
 
     def _forget(self) -> None:
         """Restart the comparison; odometry that is missing now has to restart, too."""
