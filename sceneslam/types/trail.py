@@ -15,6 +15,7 @@ from sceneslam.types.observation import SWEEP_MAX_S
 from sceneslam.types.se3 import Transform
 
 _KEPT_NS = 1_000_000_000  # no driver is later
+_JUMP = 0.1  # m, rad: more than what stamps that jitter or noisy poses make
 
 
 @dataclass(slots=True)
@@ -27,14 +28,17 @@ class Trail:
     def add(self, stamp_ns: int, T_w_base: Transform) -> None:
         """Go on to a pose (4, 4) [m]; what is known of its stamp or later is replaced.
 
-        A pose that a loop or a hand-over moved tells no velocity: the trail begins anew there.
+        Where a loop or a hand-over moved the pose, it moves the way to it as well.
         """
-        self._keep(slice(self._count_before(stamp_ns)))
-        before_s, had_velocity = self.twist_s, len(self._poses) > 1
+        self._keep(slice(self._count_before(stamp_ns - _KEPT_NS), self._count_before(stamp_ns)))
+        if len(self._poses) > 1:
+            step_s = (stamp_ns - self._stamps_ns[-1]) * 1e-9
+            T_w_expected = self._poses[-1] @ se3.exp(step_s * self.twist_s)
+            off = se3.log(se3.inverse(T_w_expected) @ T_w_base).reshape(2, 3)
+            if (np.linalg.norm(off, axis=1) > _JUMP + step_s * UNKNOWN_VELOCITY).any():
+                T_moved = T_w_base @ se3.inverse(T_w_expected)
+                self._poses = [T_moved @ pose for pose in self._poses]
         self._append(stamp_ns, T_w_base)
-        change_s = np.linalg.norm((self.twist_s - before_s).reshape(2, 3), axis=1)
-        if had_velocity and (change_s > UNKNOWN_VELOCITY).any():
-            self._keep(slice(-1, None))
 
     def move(self, stamp_ns: int, T_prev_base: Transform) -> None:
         """Go on by the motion (4, 4) [m] to an observation."""
