@@ -238,6 +238,22 @@ def test_points_that_are_no_numbers_are_dropped_with_their_times() -> None:
     np.testing.assert_array_equal(found.point_times_s, [0.0, 0.1])
 
 
+@pytest.mark.parametrize("unit", [1.0, 1e9])
+def test_times_of_points_without_a_return_cost_theirs_alone(unit: float) -> None:
+    from rosbags.typesys import Stores, get_typestore
+
+    sweep_s = np.linspace(0.0, 0.1, 50)
+    times = unit * (STAMP_NS * 1e-9 + sweep_s)
+    times[7] = 0.0
+    data = Encoder().points(STAMP_NS, np.ones((50, 3), np.float32), times)
+    message = get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr(data, "sensor_msgs/msg/PointCloud2")
+    found = cloud(message, STAMP_NS)
+    assert found.times is PointTimes.GOOD
+    assert np.isnan(found.point_times_s[7])
+    found_s = np.delete(found.point_times_s, 7)
+    np.testing.assert_allclose(found_s, np.delete(sweep_s, 7), atol=1e-6)
+
+
 def test_absolute_point_times_become_offsets() -> None:
     found = cloud(cloud_message(STAMP_NS * 1e-9 + np.array([0.0, 0.05, 0.1])), STAMP_NS)
     np.testing.assert_allclose(found.point_times_s, [0.0, 0.1], atol=1e-6)

@@ -13,8 +13,9 @@ from sceneslam.types.errors import InputError
 
 _DTYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _TIME_NAMES = ("time", "t", "timestamp", "time_stamp", "offset_time")
-_ABSOLUTE_NS = 1e15  # larger values are absolute: clocks that begin with the sensor are below
-_NS_SPAN = 1e6  # floats that span more are in ns: of 1 ms and more
+_ABSOLUTE_NS = 1e17  # larger values are absolute: clocks that begin with the sensor are below
+_NS_SPREAD = 2.5e5  # floats whose median deviation is larger are in ns: of 1 ms and more
+_ODD = 0.05  # at most such a share of the points, those without a return, has times of its own
 _SWEEP_MAX_S = 1.0  # no lidar turns slower, and its stamp is of a time that is as near
 
 
@@ -53,10 +54,7 @@ def cloud(message: Any, stamp_ns: int) -> Cloud | None:
     name = next((name for name in _TIME_NAMES if name in (rows.dtype.names or ())), None)
     times_s, times = None, PointTimes.GOOD
     if name is not None and is_good.any():
-        times_s = _offsets_s(rows[name][is_good], stamp_ns)
-        times = _judged(times_s)
-    if times_s is not None and times is PointTimes.OTHER_CLOCK:
-        times_s = times_s - np.fmin.reduce(times_s)
+        times_s, times = _judged(_offsets_s(rows[name][is_good], stamp_ns))
     kept_s = None if times is PointTimes.INVALID else times_s
     return Cloud(points_lidar=points[is_good], point_times_s=kept_s, times=times)
 
@@ -92,16 +90,32 @@ def _offsets_s(values: NDArray[Any], stamp_ns: int) -> NDArray[np.float64]:
         is_absolute = int(values.max()) > _ABSOLUTE_NS
         return (values.astype(np.int64) - is_absolute * stamp_ns).astype(np.float64) * 1e-9
     times = values.astype(np.float64)
-    largest = float(np.fmax.reduce(times))
-    if largest - float(np.fmin.reduce(times)) > _NS_SPAN:
-        return (times - (largest > _ABSOLUTE_NS) * stamp_ns) * 1e-9
-    return times - (largest * 1e9 > _ABSOLUTE_NS) * stamp_ns * 1e-9
+    usual, spread = _middle(times)
+    if usual > _ABSOLUTE_NS or spread > _NS_SPREAD:
+        return (times - (usual > _ABSOLUTE_NS) * stamp_ns) * 1e-9
+    return times - (usual * 1e9 > _ABSOLUTE_NS) * stamp_ns * 1e-9
 
 
-def _judged(times_s: NDArray[np.float64]) -> PointTimes:
-    """Tell what times (N,) [s] after the stamp can be, by how long a sweep lasts."""
+def _middle(times: NDArray[np.float64]) -> tuple[float, float]:
+    """Return the median of times (N,) and their median deviation from it; 0 if all are NaN."""
+    known = times[~np.isnan(times)]
+    if not len(known):
+        return 0.0, 0.0
+    middle = float(np.median(known))
+    return middle, float(np.median(np.abs(known - middle)))
+
+
+def _judged(times_s: NDArray[np.float64]) -> tuple[NDArray[np.float64], PointTimes]:
+    """Return times (N,) [s] after the stamp, NaN where odd, and by a sweep's length what they are.
+
+    Those of another clock are after the first point.
+    """
+    is_odd = np.abs(times_s - _middle(times_s)[0]) >= _SWEEP_MAX_S
+    if is_odd.mean() <= _ODD:
+        times_s = np.where(is_odd, np.nan, times_s)
     first_s, last_s = float(np.fmin.reduce(times_s)), float(np.fmax.reduce(times_s))
     if not last_s - first_s < _SWEEP_MAX_S:  # also if all are NaN
-        return PointTimes.INVALID
-    is_near = first_s < _SWEEP_MAX_S and last_s > -_SWEEP_MAX_S
-    return PointTimes.GOOD if is_near else PointTimes.OTHER_CLOCK
+        return times_s, PointTimes.INVALID
+    if first_s < _SWEEP_MAX_S and last_s > -_SWEEP_MAX_S:
+        return times_s, PointTimes.GOOD
+    return times_s - first_s, PointTimes.OTHER_CLOCK
