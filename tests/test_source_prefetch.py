@@ -138,9 +138,11 @@ def test_clock_of_one_sensor_does_not_take_the_others_apart(ahead_s: int) -> Non
     assert all(one.depth and one.depth.value == one.primary.value for one in found)
 
 
-@pytest.mark.parametrize("bad", [0, 20])
+@pytest.mark.parametrize(("bad", "off_s"), [(0, 1000), (20, 1000), (20, -30), (20, -1000)])
 @pytest.mark.parametrize("sensor", [Sensor.IMAGE, Sensor.DEPTH, Sensor.ODOMETRY, Sensor.GYRO])
-def test_one_stamp_ahead_costs_one_sample_and_is_counted(sensor: Sensor, bad: int) -> None:
+def test_one_wrong_stamp_costs_one_sample_and_is_counted(
+    sensor: Sensor, bad: int, off_s: int
+) -> None:
     streams = (Sensor.IMAGE, Sensor.DEPTH, Sensor.ODOMETRY, Sensor.GYRO)
     faults = FaultLog()
     synchroniser = Synchroniser(Sensor.IMAGE, frozenset(streams), 0.02, faults=faults)
@@ -148,9 +150,9 @@ def test_one_stamp_ahead_costs_one_sample_and_is_counted(sensor: Sensor, bad: in
     for number in range(100):
         for each in streams:
             at_ns = number * 33 * MS
-            ahead_ns = 10**12 if (each, number) == (sensor, bad) else 0
+            off_ns = off_s * 10**9 if (each, number) == (sensor, bad) else 0
             value = se3.identity() if each is Sensor.ODOMETRY else number
-            sample = Sample(stamp_ns=at_ns + ahead_ns, arrived_ns=at_ns, value=value)
+            sample = Sample(stamp_ns=at_ns + off_ns, arrived_ns=at_ns, value=value)
             found += synchroniser.add(each, sample)
     found += synchroniser.flush()
     assert len(found) >= 99
@@ -158,7 +160,8 @@ def test_one_stamp_ahead_costs_one_sample_and_is_counted(sensor: Sensor, bad: in
     assert sum(one.T_odom_base is None for one in found) <= 2
     assert sum(len(one.samples[Sensor.GYRO]) for one in found) >= 98
     (fault,) = faults.sentences()
-    assert f"{sensor.value} left out, its stamp is ahead of the next one: 1 time" in fault
+    where = "ahead of the next one" if off_s > 0 else "behind the one before"
+    assert f"{sensor.value} left out, its stamp is {where}: 1 time" in fault
 
 
 def live_sets(

@@ -76,6 +76,8 @@ class Synchroniser:
         self._held: dict[Sensor, deque[Sample]] = {
             sensor: deque(maxlen=_MOST_HELD) for sensor in streams - {primary}
         }
+        self._leapt: set[Sensor] = set()  # streams whose newest sample is far after the one before
+        self._behind: set[Sensor] = set()  # those whose newest one was far before, and left out
         self._seen_ns: dict[Sensor, int] = {}  # the stamp of each stream's newest sample
         self._arrived_ns = 0  # the latest arrival
         self._delays_ns: deque[int] = deque(maxlen=_DELAYS)  # of depth, from stamp to arrival
@@ -86,10 +88,20 @@ class Synchroniser:
     def add(self, sensor: Sensor, sample: Sample) -> Iterator[SynchronisedSamples]:
         """Add a sample; yield the sets that are complete now."""
         queue = self._waiting if sensor is self._primary else self._held[sensor]
+        before_ns = self._seen_ns.get(sensor)
+        is_behind = before_ns is not None and before_ns > sample.stamp_ns + _REACH_NS
+        if is_behind and sensor not in self._leapt | self._behind:
+            self._behind.add(sensor)  # if the next one is, too, the clock was set back
+            self._leave_out(sensor, sample, "behind the one before")
+            return
+        self._behind.discard(sensor)
         while queue and queue[-1].stamp_ns > sample.stamp_ns + _REACH_NS:
-            fault = f"{sensor.value} left out, its stamp is ahead of the next one"
-            self._faults.add(fault, at_stamp(queue.pop().stamp_ns))
+            self._leave_out(sensor, queue.pop(), "ahead of the next one")
         queue.append(sample)
+        if before_ns is None or sample.stamp_ns > before_ns + _REACH_NS:
+            self._leapt.add(sensor)
+        else:
+            self._leapt.discard(sensor)
         self._seen_ns[sensor] = sample.stamp_ns
         self._arrived_ns = max(self._arrived_ns, sample.arrived_ns)
         if sensor is Sensor.DEPTH:
@@ -122,6 +134,10 @@ class Synchroniser:
         """Yield the remaining sets at the end of the recording."""
         while self._waiting:
             yield self._bundle(self._waiting.popleft())
+
+    def _leave_out(self, sensor: Sensor, sample: Sample, where: str) -> None:
+        fault = f"{sensor.value} left out, its stamp is {where}"
+        self._faults.add(fault, at_stamp(sample.stamp_ns))
 
     def _is_complete(self, primary: Sample) -> bool:
         """Tell whether no stream can still have a sample for the primary one's stamp."""
