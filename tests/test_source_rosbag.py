@@ -84,6 +84,13 @@ def test_a_split_bag_is_read_as_one(tmp_path: Path) -> None:
     assert source.length == 6 and source.faults == []
 
 
+def test_bags_of_other_names_are_no_parts(tmp_path: Path) -> None:
+    for name in ("kitchen.bag", "garage.bag"):
+        (tmp_path / name).touch()
+    with pytest.raises(InputError, match=r"not parts of one bag, give one of garage\.bag, kitchen"):
+        make_source("rosbag", tmp_path)
+
+
 @pytest.mark.parametrize("mode", [CompressionMode.MESSAGE, CompressionMode.FILE])
 @pytest.mark.parametrize("storage", list(StoragePlugin))
 def test_recordings_of_every_compression_are_read(

@@ -55,6 +55,9 @@ def _open_folder(path: Path) -> Recording:
         raise InputError(f"recording: its metadata.yaml is missing; write it by `{how}`: {path}")
     bags = files_by_number(path, {".bag"})
     if not metadata.is_file() and bags:
+        if len({re.sub(r"\d+", "0", bag.stem) for bag in bags}) > 1:
+            names = ", ".join(bag.name for bag in bags)
+            raise InputError(f"recording: not parts of one bag, give one of {names}: {path}")
         return open_bags(bags)
     if not metadata.is_file():
         raise InputError(
