@@ -182,6 +182,13 @@ def test_scans_after_the_clock_was_set_back_keep_their_rate(
     np.testing.assert_allclose(found_ns[good] - 10**18, true_ns[good] - 10**18, atol=1000)
 
 
+def test_a_clock_that_was_ahead_for_a_while_is_right_again_after_a_pause() -> None:
+    logged_ns = np.array([0.0, 0.2, 0.4, 1000.6, 1000.8, 4.2, 4.4]) * 1e9
+    found_ns = continued_stamps(logged_ns.astype(np.int64), 2 * 10**9)
+    assert (np.diff(found_ns) > 0).all()
+    np.testing.assert_allclose(np.delete(found_ns, [3, 4]), np.delete(logged_ns, [3, 4]))
+
+
 def test_a_log_whose_stamps_are_all_zero_is_stamped_by_its_logger(tmp_path: Path) -> None:
     lines = [flaser([2.0] * 180, "0")[: -len("0.1")] + f"{0.2 * number:.1f}" for number in range(5)]
     source = make_source("carmen", write(tmp_path / "a.log", *lines))

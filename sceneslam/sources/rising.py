@@ -94,7 +94,9 @@ def _is_undone(
     is_between = before_ns <= run_ns[0] and run_ns[-1] <= after_ns
     if is_between or after_ns < before_ns:
         return False
-    return len(run_ns) == 1 or abs(after_ns - before_ns - (run_ns[-1] - run_ns[0])) <= jump_ns
+    if len(run_ns) == 1 or run_ns[0] > after_ns:  # the clock was ahead for a time
+        return True
+    return bool(abs(after_ns - before_ns - (run_ns[-1] - run_ns[0])) <= jump_ns)
 
 
 def measured_stamps(received_ns: NDArray[np.int64]) -> NDArray[np.int64]:
