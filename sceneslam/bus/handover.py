@@ -39,7 +39,7 @@ class Handover:
     ) -> None:
         assert session.runner is not None
         self.session, self.runner = session, session.runner
-        self.anchor = replace(anchor)  # the memory may remove it
+        self.anchor = replace(anchor)  # a correction moves that of the memory, too
         self.trail: list[BufferedObservation] = []  # after the anchor; with it, if it is bridged
         self.tracked: list[Tracking] = []  # its answers from the anchor on, while it tracks
         self._pace, self._memory = pace, memory
@@ -102,7 +102,7 @@ class Handover:
 
         Its earlier observations belong to its trial, not to the hand-over. Raises ModuleError.
         """
-        last, anchor = self.session.hold.tracking, self._memory.newest
+        last, anchor = self.session.hold.tracking, replace(self._memory.newest)
         assert last is not None, "it tracks now"
         self.began_ns, self._cost_ns = anchor.stamp_ns, 0
         self.anchor, self.trail, self.tracked = anchor, [], [last]
