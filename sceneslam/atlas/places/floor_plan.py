@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -102,15 +103,15 @@ def join(placed: Sequence[tuple[Planar, FloorPlan]], *, newest_wins: bool = Fals
     normals = [plan.normals @ planar.rotation(float(T[2])).T for T, plan in placed]
     low, (rows, columns) = _box(np.concatenate([*points, *(_corners(T, p) for T, p in placed)]))
     free = np.zeros((rows, columns), bool)
-    kept: list[NDArray[np.float64]] = []  # (P, 4): points and normals
-    for (T, plan), *walls in zip(placed, points, normals, strict=True):
+    newest = np.zeros((rows, columns), np.int32)  # plan that saw free space around the cell
+    for number, (T, plan) in enumerate(placed):
         seen = _laid(T, plan, low, (rows, columns))
         if newest_wins:
-            inner = cv2.erode(seen.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-            kept = [each[~_at(inner, each[:, :2], low)] for each in kept]
+            newest[cv2.erode(seen.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0] = number
         free |= seen
-        kept.append(np.concatenate(walls, axis=1))
-    left = np.concatenate(kept)
+    numbers = np.repeat(np.arange(len(points)), [len(walls) for walls in points])
+    left = np.concatenate([np.concatenate(points), np.concatenate(normals)], axis=1)
+    left = left[_at(newest, left[:, :2], low) <= numbers]
     index, _, centres, mean = _binned(left[:, :2], left[:, 2:], low, columns)
     free.reshape(-1)[index] = False
     return _plan(centres, mean, free, low)
@@ -221,9 +222,7 @@ def _laid(
     return np.asarray(cv2.warpAffine(plan.free.astype(np.uint8), affine, size_wh, flags=flags) > 0)
 
 
-def _at(
-    image: NDArray[np.bool_], points: NDArray[np.float64], low: NDArray[np.int64]
-) -> NDArray[np.bool_]:
+def _at(image: NDArray[Any], points: NDArray[np.float64], low: NDArray[np.int64]) -> NDArray[Any]:
     return np.asarray(image.reshape(-1)[_index(points, low, image.shape[1])])
 
 
