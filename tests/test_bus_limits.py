@@ -148,7 +148,7 @@ def test_a_sensor_is_silent_after_two_of_its_periods():
     assert held.health is Health.HELD and held.is_held and held.unheld_since_ns is None
     silent = asked(0, S // 10, silent_ns=3 * S // 10 + 1)
     assert silent.health is Health.SILENT and not silent.is_held
-    assert silent.unheld_since_ns == silent.held_ns == 3 * S // 10 + 1
+    assert (silent.unheld_since_ns, silent.held_ns) == (3 * S // 10 + 1, S // 10)
     assert asked(0, silent_ns=6 * S).is_held and not asked(0, silent_ns=6 * S + 1).is_held
     after_a_gap = 0, S // 10, 2 * S
     assert asked(*after_a_gap, silent_ns=22 * S // 10).is_held

@@ -83,7 +83,7 @@ class Hold:
             runner.skip(observation)
             self.spare(observation)
             if self._fed_ns is None or observation.stamp_ns - self._fed_ns > 2 * self._period_ns:
-                self.lose(observation.stamp_ns)
+                self.lose(observation.stamp_ns, self._fed_ns)
                 self.adrift_since_ns = None
             return None
         tracking = runner.track(observation)
@@ -170,12 +170,13 @@ class Hold:
                 self.turn = _turn(*self._agreed, *now, T_odom_prev)
             self._agreed = now
 
-    def lose(self, stamp_ns: int) -> None:
-        """Record that the module does not track, for whatever reason."""
+    def lose(self, stamp_ns: int, held_until_ns: int | None = None) -> None:
+        """Record that the module does not track, for whatever reason; silent, since earlier."""
         if self.unheld_since_ns is None:
             self.unheld_since_ns = stamp_ns
-            held_since_ns, self.held_since_ns = self.held_since_ns, None
-            self.held_ns = stamp_ns - held_since_ns if held_since_ns is not None else 0
+            until_ns = stamp_ns if held_until_ns is None else held_until_ns
+            self.held_ns = 0 if self.held_since_ns is None else until_ns - self.held_since_ns
+            self.held_since_ns = None
 
 
 def _turn(
