@@ -72,10 +72,11 @@ def test_anchor_is_the_newest_trusted_moment_before_the_scene_began():
     assert memory.anchor(19 * PERIOD_NS).stamp_ns == 10 * PERIOD_NS
 
 
-def test_anchor_falls_back_on_the_oldest_pose_then_on_the_oldest_moment():
+def test_anchor_falls_back_on_the_newest_answer_the_oldest_pose_the_oldest_moment():
     never = lambda index: False  # noqa: E731
     late = filled(9, is_trusted=never, has_pose=lambda index: index >= 4)
-    assert late.anchor(None).stamp_ns == 4 * PERIOD_NS
+    assert late.anchor(6 * PERIOD_NS).stamp_ns == 6 * PERIOD_NS
+    assert late.anchor(3 * PERIOD_NS).stamp_ns == 4 * PERIOD_NS
     assert filled(9, is_trusted=never, has_pose=never).anchor(None).stamp_ns == 0
 
 

@@ -113,13 +113,14 @@ class ObservationBuffer:
     def anchor(self, until_ns: int | None) -> BufferedObservation:
         """Return the newest trusted entry, not after `until_ns` if that is given.
 
-        Without a trusted entry, the oldest with a pose; without a pose, the oldest.
+        Without a trusted entry, the newest by a module; without that, the oldest with a pose;
+        without a pose, the oldest.
         """
         posed = [moment for moment in self._moments if moment.T_map_base is not None]
-        for moment in reversed(posed):
-            if moment.is_trusted and (until_ns is None or moment.stamp_ns <= until_ns):
-                return moment
-        return posed[0] if posed else self._moments[0]
+        ended = [one for one in posed if until_ns is None or one.stamp_ns <= until_ns]
+        trusted = [one for one in ended if one.is_trusted]
+        measured = [one for one in ended if one.module != BRIDGED]
+        return [*posed[:1], *measured[-1:], *trusted[-1:]][-1] if posed else self._moments[0]
 
     def after(self, stamp_ns: int) -> list[BufferedObservation]:
         """Return all entries after a stamp."""
