@@ -261,7 +261,8 @@ class Gate:
 
     def _jumps(self, now: _Sample) -> tuple[float, float]:
         """Return the largest recent changes of velocity [m/s]: the module's, the wheels'."""
-        late = [*self._samples[self._until(now.stamp_ns - _LATE_NS) :], now]
+        newest_ns = self._samples[-1].stamp_ns if self._samples else now.stamp_ns  # before a gap
+        late = [*self._samples[self._until(newest_ns - _LATE_NS) :], now]
         times_s = np.array([(sample.stamp_ns - now.stamp_ns) / 1e9 for sample in late])
         before = np.searchsorted(times_s, times_s - _STEP_S, side="right") - 1
         earlier = before.copy()  # whose velocity it is compared with
@@ -272,6 +273,8 @@ class Gate:
         elapsed_s = np.where(is_known, times_s - times_s[before], np.nan)
         # Over a short interval, an error of position makes a larger one of velocity.
         share = np.minimum(np.minimum(elapsed_s, 2.0 * elapsed_s[earlier]), _STEP_S) / _STEP_S
+        # Across a gap, a change has acted for longer and explains more.
+        share *= np.maximum(elapsed_s - np.median(np.diff(times_s)), _STEP_S) / _STEP_S
         found = []
         for poses in ([one.T_local_base for one in late], [one.T_odom_base for one in late]):
             points = np.array([T[:3, 3] + T[:3, 0] for T in poses])
