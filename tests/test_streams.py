@@ -6,6 +6,8 @@ import sys
 
 import pytest
 
+from sceneslam.storage.folder import RunFolder
+
 WRITE = """
 import os, sys
 from sceneslam.streams import lost_output, secure_streams
@@ -48,6 +50,7 @@ def test_what_a_terminal_cannot_show_is_no_error():
 
 
 def test_a_sweep_is_continued_without_a_reader(tmp_path):
+    RunFolder.claim(tmp_path, kind="sweep").close()
     (tmp_path / ".sweep").mkdir()
     kept = {"launcher": {"backend": "basic"}, "began_in": str(tmp_path), "jobs": ["0"]}
     (tmp_path / ".sweep" / "sweep.json").write_text(json.dumps(kept))
