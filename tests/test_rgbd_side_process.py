@@ -3,6 +3,7 @@
 import gc
 import os
 import signal
+import threading
 from pathlib import Path
 
 import pytest
@@ -60,4 +61,18 @@ def test_side_process_ends_with_what_owned_it():
     pid = process.submit("pid").result()
     del process
     gc.collect()
+    assert not runs(pid)
+
+
+def test_side_process_ends_in_whichever_thread_drops_it():
+    kept = [SideProcess(Counter, 0)]
+    pid = kept[0].submit("pid").result()
+    dropped = threading.Event()
+
+    def drop(_):
+        kept.clear()  # in the process's own thread, which cannot wait for itself
+        dropped.set()
+
+    kept[0].submit(1).add_done_callback(drop)
+    assert dropped.wait(30)
     assert not runs(pid)

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from typing import IO, Any, Generic, TypeVar
 from weakref import finalize
 
@@ -47,8 +48,9 @@ class SideProcess(Generic[Task, Result]):
         return self._line.submit(_ask, self._popen, task)
 
     def end(self) -> None:
-        """End the process, even during a task; may be called twice."""
+        """End the process, even during a task; may be called twice. No thread remains."""
         self._end()
+        self._line.shutdown(wait=True)
 
 
 def main() -> None:
@@ -74,7 +76,7 @@ def _ask(popen: subprocess.Popen[bytes], task: Any) -> Any:
     try:
         _send(popen.stdin, task)
         return pickle.load(popen.stdout)
-    except (OSError, EOFError, pickle.UnpicklingError) as error:
+    except (OSError, EOFError, ValueError, pickle.UnpicklingError) as error:
         raise ModuleError("rgbd: the process that adjusts its map has ended") from error
 
 
@@ -85,13 +87,14 @@ def _send(stream: IO[bytes] | None, value: Any) -> None:
 
 
 def _end(popen: subprocess.Popen[bytes], line: ThreadPoolExecutor) -> None:
-    """Kill the process; no zombie, thread or open pipe remains."""
+    """Kill the process; no zombie or open pipe remains.
+
+    It joins no thread: the garbage collector may call it in any, whatever lock that holds.
+    """
     popen.kill()
-    line.shutdown(wait=True, cancel_futures=True)
+    line.shutdown(wait=False, cancel_futures=True)
     popen.wait()
     for stream in (popen.stdin, popen.stdout):
         assert stream is not None
-        try:
+        with suppress(BrokenPipeError):  # what had not been sent
             stream.close()
-        except BrokenPipeError:  # what had not been sent
-            continue
