@@ -327,3 +327,14 @@ def test_a_ramp_refutes_no_module():
         witness=lambda step: Witness(missed_rad=0.0),
     )
     assert not any(judgement.is_wrong for judgement in judgements)
+
+
+@pytest.mark.parametrize("steps", [4, 7, 11])
+def test_who_stood_still_over_a_loss_is_wrong(steps):
+    """A module that goes on from its last pose before the loss, or wheels that stuck in it."""
+    stuck = frozen(100, 100 + steps)
+    after = slice(100 + steps, 110 + steps)
+    module = witnessed(lost_between(stuck, 101, 100 + steps), steps=130)[after]
+    assert all(one.is_wrong and not one.wheels_lie for one in module)
+    wheels = witnessed(lost_between(arc, 101, 100 + steps), odometry=stuck, steps=130)[after]
+    assert all(one.wheels_lie and not one.is_wrong for one in wheels)
