@@ -189,6 +189,20 @@ def test_a_clock_that_was_ahead_for_a_while_is_right_again_after_a_pause() -> No
     np.testing.assert_allclose(np.delete(found_ns, [3, 4]), np.delete(logged_ns, [3, 4]))
 
 
+@pytest.mark.parametrize(("run_off_s", "later_off_s"), [(0.0, -25.0), (500.0, 0.0)])
+def test_a_run_after_a_pause_is_believed_unless_its_clock_was_ahead(
+    run_off_s: float, later_off_s: float
+) -> None:
+    """A run of 20 s after 10 s; the clock is then set back farther than the run is long."""
+    true_s = np.r_[0:100:0.1, 110:130:0.1, 130:200:0.1]
+    is_run, is_later = (true_s >= 110) & (true_s < 130), true_s >= 130
+    logged_s = true_s + run_off_s * is_run + later_off_s * is_later
+    found_ns = continued_stamps(np.rint(logged_s * 1e9).astype(np.int64), 2 * 10**9)
+    assert (np.diff(found_ns) > 0).all()
+    known = ~is_run if run_off_s else np.full(len(true_s), True)  # a run ahead is interpolated
+    np.testing.assert_allclose(found_ns[known] * 1e-9, true_s[known], atol=1e-6)
+
+
 def test_a_log_whose_stamps_are_all_zero_is_stamped_by_its_logger(tmp_path: Path) -> None:
     lines = [flaser([2.0] * 180, "0")[: -len("0.1")] + f"{0.2 * number:.1f}" for number in range(5)]
     source = make_source("carmen", write(tmp_path / "a.log", *lines))

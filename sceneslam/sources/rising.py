@@ -94,9 +94,12 @@ def _is_undone(
     is_between = before_ns <= run_ns[0] and run_ns[-1] <= after_ns
     if is_between or after_ns < before_ns:
         return False
-    if len(run_ns) == 1 or run_ns[0] > after_ns:  # the clock was ahead for a time
+    if len(run_ns) == 1:
         return True
-    return bool(abs(after_ns - before_ns - (run_ns[-1] - run_ns[0])) <= jump_ns)
+    missing_ns = run_ns[-1] - run_ns[0] - (after_ns - before_ns)  # of the time for the run
+    if run_ns[0] > after_ns:  # the clock was ahead for a time, which may have begun with a pause
+        return bool(missing_ns <= jump_ns)
+    return bool(abs(missing_ns) <= jump_ns)
 
 
 def measured_stamps(received_ns: NDArray[np.int64]) -> NDArray[np.int64]:
