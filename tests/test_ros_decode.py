@@ -239,19 +239,33 @@ def test_points_that_are_no_numbers_are_dropped_with_their_times() -> None:
 
 
 @pytest.mark.parametrize("unit", [1.0, 1e9])
-def test_times_of_points_without_a_return_cost_theirs_alone(unit: float) -> None:
+@pytest.mark.parametrize(
+    ("odd", "odd_m"), [(slice(7, 8), 1.0), (slice(7, 8), 0.0), (slice(5, 45), 0.0)]
+)
+@pytest.mark.parametrize("odd_time", [0.0, np.nan])
+def test_odd_times_of_points_without_a_return_become_the_usual_one(
+    unit: float, odd: slice, odd_m: float, odd_time: float
+) -> None:
     from rosbags.typesys import Stores, get_typestore
 
-    sweep_s = np.linspace(0.0, 0.1, 50)
+    sweep_s, points = np.linspace(0.0, 0.1, 50), np.ones((50, 3), np.float32)
     times = unit * (STAMP_NS * 1e-9 + sweep_s)
-    times[7] = 0.0
-    data = Encoder().points(STAMP_NS, np.ones((50, 3), np.float32), times)
+    times[odd], points[odd] = odd_time, odd_m
+    data = Encoder().points(STAMP_NS, points, times)
     message = get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr(data, "sensor_msgs/msg/PointCloud2")
     found = cloud(message, STAMP_NS)
     assert found.times is PointTimes.GOOD
-    assert np.isnan(found.point_times_s[7])
-    found_s = np.delete(found.point_times_s, 7)
-    np.testing.assert_allclose(found_s, np.delete(sweep_s, 7), atol=1e-6)
+    found_s = np.delete(found.point_times_s, odd)
+    np.testing.assert_allclose(found_s, np.delete(sweep_s, odd), atol=1e-6)
+    np.testing.assert_allclose(found.point_times_s[odd], 0.05, atol=2e-3)
+
+
+def test_a_cloud_without_any_return_has_its_times() -> None:
+    message = cloud_message(SWEEP_S)
+    message.data = np.where(np.arange(message.data.size) % 20 < 12, 0, message.data)
+    found = cloud(message, STAMP_NS)
+    assert not found.points_lidar.any()
+    np.testing.assert_allclose(found.point_times_s, SWEEP_S)
 
 
 def test_absolute_point_times_become_offsets() -> None:

@@ -571,6 +571,23 @@ def test_times_of_points_that_cannot_be_are_named(
     assert sentence.startswith("/points: the times of points are")
 
 
+def test_points_without_a_return_are_no_faults(tmp_path: Path) -> None:
+    """A driver writes them as (0, 0, 0) at 0, and the others at absolute times."""
+    sweep_s, points = np.linspace(0.0, 0.1, 50), np.full((50, 3), 2.0, np.float32)
+    times_s = STAMP_NS * 1e-9 + sweep_s
+    points[::3] = times_s[::3] = 0.0
+    data = Encoder().points(STAMP_NS, points, times_s)
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        recorder.add(
+            "/points", STAMP_NS, store.deserialize_cdr(data, "sensor_msgs/msg/PointCloud2")
+        )
+    source = make_source("rosbag", tmp_path / "a.mcap")
+    (one,) = source
+    assert source.faults == [] and not preflight(source.survey(), source.rig).warnings
+    assert np.ptp(one.point_times_s) == pytest.approx(0.1 - sweep_s[1], abs=1e-6)
+
+
 @pytest.mark.parametrize("late_s", [0.04, 0.0])
 def test_points_without_times_are_as_old_as_their_cloud(tmp_path: Path, late_s: float) -> None:
     stamp_ns = STAMP_NS - round(late_s * 1e9)

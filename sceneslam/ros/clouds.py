@@ -15,7 +15,7 @@ _DTYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8
 _TIME_NAMES = ("time", "t", "timestamp", "time_stamp", "offset_time")
 _ABSOLUTE_NS = 1e17  # larger values are absolute: clocks that begin with the sensor are below
 _NS_SPREAD = 2.5e5  # floats whose median deviation is larger are in ns: of 1 ms and more
-_ODD = 0.05  # at most such a share of the points, those without a return, has times of its own
+_ODD = 0.05  # at most such a share of the points with a return has times that no sweep can have
 _SWEEP_MAX_S = 1.0  # no lidar turns slower, and its stamp is of a time that is as near
 
 
@@ -54,7 +54,10 @@ def cloud(message: Any, stamp_ns: int) -> Cloud | None:
     name = next((name for name in _TIME_NAMES if name in (rows.dtype.names or ())), None)
     times_s, times = None, PointTimes.GOOD
     if name is not None and is_good.any():
-        times_s, times = _judged(_offsets_s(rows[name][is_good], stamp_ns))
+        # Points without a return are (0, 0, 0), and drivers give them any time.
+        has_return = np.linalg.norm(points[is_good], axis=1) > 0
+        trusted = has_return if has_return.any() else ~has_return
+        times_s, times = _judged(_offsets_s(rows[name][is_good], trusted, stamp_ns), trusted)
     kept_s = None if times is PointTimes.INVALID else times_s
     return Cloud(points_lidar=points[is_good], point_times_s=kept_s, times=times)
 
@@ -84,13 +87,18 @@ def _rows(message: Any, fields: dict[str, Any]) -> NDArray[Any] | None:
     return np.ascontiguousarray(packed).reshape(-1).view(dtype)
 
 
-def _offsets_s(values: NDArray[Any], stamp_ns: int) -> NDArray[np.float64]:
-    """Return times (N,) [s] after the stamp: integers are in ns, floats in s or ns."""
+def _offsets_s(
+    values: NDArray[Any], trusted: NDArray[np.bool_], stamp_ns: int
+) -> NDArray[np.float64]:
+    """Return times (N,) [s] after the stamp: integers are in ns, floats in s or ns.
+
+    Which they are is judged by the points `trusted` (N,).
+    """
     if values.dtype.kind in "iu":
-        is_absolute = int(values.max()) > _ABSOLUTE_NS
+        is_absolute = int(values[trusted].max()) > _ABSOLUTE_NS
         return (values.astype(np.int64) - is_absolute * stamp_ns).astype(np.float64) * 1e-9
     times = values.astype(np.float64)
-    usual, spread = _middle(times)
+    usual, spread = _middle(times[trusted])
     if usual > _ABSOLUTE_NS or spread > _NS_SPREAD:
         return (times - (usual > _ABSOLUTE_NS) * stamp_ns) * 1e-9
     return times - (usual * 1e9 > _ABSOLUTE_NS) * stamp_ns * 1e-9
@@ -105,14 +113,18 @@ def _middle(times: NDArray[np.float64]) -> tuple[float, float]:
     return middle, float(np.median(np.abs(known - middle)))
 
 
-def _judged(times_s: NDArray[np.float64]) -> tuple[NDArray[np.float64], PointTimes]:
-    """Return times (N,) [s] after the stamp, NaN where odd, and by a sweep's length what they are.
+def _judged(
+    times_s: NDArray[np.float64], trusted: NDArray[np.bool_]
+) -> tuple[NDArray[np.float64], PointTimes]:
+    """Return times (N,) [s] after the stamp, and by a sweep's length what they are.
 
-    Those of another clock are after the first point.
+    Odd ones become the usual one if few of the points `trusted` (N,) have them. Times of another
+    clock are after the first point.
     """
-    is_odd = np.abs(times_s - _middle(times_s)[0]) >= _SWEEP_MAX_S
-    if is_odd.mean() <= _ODD:
-        times_s = np.where(is_odd, np.nan, times_s)
+    usual_s, _ = _middle(times_s[trusted])
+    is_odd = ~(np.abs(times_s - usual_s) < _SWEEP_MAX_S)  # also if NaN
+    if is_odd[trusted].mean() <= _ODD:
+        times_s = np.where(is_odd, usual_s, times_s)
     first_s, last_s = float(np.fmin.reduce(times_s)), float(np.fmax.reduce(times_s))
     if not last_s - first_s < _SWEEP_MAX_S:  # also if all are NaN
         return times_s, PointTimes.INVALID
