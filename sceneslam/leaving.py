@@ -18,12 +18,17 @@ def leave_threads(code: int) -> None:
     Python waits for every thread that is not a daemon, such as one that waits for input. Those that
     still run then are named in a warning, and end with the process.
     """
-    args = ([one for one in threading.enumerate() if not one.daemon], code)
+    threads = [one for one in threading.enumerate() if not one.daemon]
+    is_ending = threading.Event()
+    # Python calls the newest first of what is registered so, then waits for the threads of pools,
+    # which is registered as well, then for the others, and only then calls `atexit` functions.
+    threading._register_atexit(is_ending.set)  # type: ignore[attr-defined]
+    args = (threads, code, is_ending)
     threading.Thread(target=_watch, args=args, name="exit", daemon=True).start()
 
 
-def _watch(threads: list[threading.Thread], code: int) -> None:
-    threading.main_thread().join()  # a program that called ours may go on
+def _watch(threads: list[threading.Thread], code: int, is_ending: threading.Event) -> None:
+    is_ending.wait()  # a program that called ours may go on
     sleep(_PATIENCE_S)
     left = [one.name for one in threads if one.is_alive() and one is not threading.main_thread()]
     if not left:

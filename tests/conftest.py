@@ -38,7 +38,7 @@ def own_logging() -> Iterator[None]:
 def own_end() -> Iterator[None]:
     """Let no command that ran inside the tests' process end that with its own exit code."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(leaving, "_watch", lambda threads, code: None)
+        patch.setattr(leaving, "_watch", lambda *_: None)
         yield
 
 

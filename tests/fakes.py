@@ -6,6 +6,7 @@ import json
 import os
 import signal
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -123,11 +124,12 @@ class ExactModule:
 
 
 class LingeringModule(ExactModule):
-    """Leaves a thread running that waits for ever."""
+    """Leaves two threads running that wait for ever, one of them of a pool."""
 
     def __init__(self):
         super().__init__()
         threading.Thread(target=threading.Event().wait, name="lingering").start()
+        ThreadPoolExecutor(1, "lingering").submit(threading.Event().wait)
 
 
 class ClosingModule(ExactModule):

@@ -266,19 +266,19 @@ def test_ctrl_c_before_the_first_observation_is_one_sentence(tmp_path, pressed_i
     assert done.stderr == "error: stopped before the first observation\n"
 
 
-def test_thread_that_a_module_leaves_running_is_named_and_does_not_delay_the_exit(folder):
+def test_threads_that_a_module_leaves_running_are_named_and_do_not_delay_the_exit(folder):
     done = pressed(folder, 0, "~slam.only", "+slam.only={_target_:fakes.LingeringModule}")
     assert done.returncode == 0
-    assert "ended with the process: thread lingering\n" in done.stderr
+    assert "ended with the process: thread lingering, lingering_0\n" in done.stderr
 
 
-def test_thread_that_a_trial_leaves_running_does_not_keep_the_experiment(capfd):
+def test_threads_that_a_trial_leaves_running_do_not_keep_the_experiment(capfd):
     context = get_context("spawn")
     reader, writer = context.Pipe(duplex=False)
     pool = ProcessPoolExecutor(1, context, initializer=_end_with, initargs=(reader,))
     with reader, writer, pool:
         pool.submit(exec, "from fakes import LingeringModule; LingeringModule()").result()
-    assert "ended with the process: thread lingering\n" in capfd.readouterr().err
+    assert "ended with the process: thread lingering, lingering_0\n" in capfd.readouterr().err
 
 
 def test_ctrl_c_while_the_reference_is_saved_is_before_the_run_itself(folder):
