@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from sceneslam.types.command import Command
 from sceneslam.types.experiment import RunTrials, Verdict
-from sceneslam.types.maps import HybridMap, MapLayers
+from sceneslam.types.maps import HybridMap, MapLayers, MovedMap
 from sceneslam.types.observation import Observation, SceneVote, Tracking
 from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.run import Event, RunResult
@@ -346,8 +346,12 @@ class BackEnd(Protocol):
         """
         ...
 
-    def rewind(self, stamp_ns: int) -> None:
-        """Remove the poses from a stamp on, to be replaced by better ones."""
+    def rewind(self, stamp_ns: int, T_new_told: Transform | None = None) -> None:
+        """Remove the poses from a stamp on, to be replaced by better ones.
+
+        `T_new_told` (4, 4): how the module has corrected the last pose left since that was added,
+        where the session goes on from it; None: another session begins.
+        """
         ...
 
     def close_session(self, session: int, layers: MapLayers, revised: Trajectory) -> None:
@@ -419,6 +423,15 @@ class CovarianceSink(Protocol):
 
 
 @runtime_checkable
+class MapSink(Protocol):
+    """A sink that also shows a map while the run goes on."""
+
+    def write_map(self, moved: MovedMap) -> None:
+        """Correct the map: loops or a loaded map moved it. Called before the next `write`."""
+        ...
+
+
+@runtime_checkable
 class Steering(Protocol):
     """A sink through which an operator controls the run."""
 
@@ -441,6 +454,10 @@ class LiveMapper(Protocol):
 
     def add(self, observation: Observation, T_map_base: Transform, T_map_then: Transform) -> None:
         """Add an observation at T_map_base (4, 4) [m]; at its scan's stamp, base was T_map_then."""
+        ...
+
+    def move(self, moved: MovedMap) -> None:
+        """Move what was drawn to where it is now."""
         ...
 
     def map(self) -> HybridMap:
@@ -477,7 +494,7 @@ class TrajectoryLog(Protocol):
         """Record a pose of the global trajectory; module "": bridged."""
         ...
 
-    def add_rewind(self, stamp_ns: int) -> None:
+    def add_rewind(self, stamp_ns: int, T_new_told: Transform | None) -> None:
         """Record that the poses from a stamp on are removed."""
         ...
 

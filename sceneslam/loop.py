@@ -315,6 +315,8 @@ class RunLoop:
     def _write(self, observation: Observation) -> None:
         """Pass the observation with its pose to the sinks, then the events."""
         atlas = self._parts.atlas
+        if self._sinks.show_maps and (moved := atlas.take_moved()) is not None:
+            self._sinks.write_map(moved)
         T_map_base = atlas.pose_at(observation.stamp_ns)
         self._sinks.write(observation, T_map_base, atlas.last_covariance, self._bus.active)
         self._write_events()

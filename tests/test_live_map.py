@@ -42,6 +42,9 @@ class Notes:
         if observation.stamp_ns < 0:
             raise ValueError("a depth of letters")
 
+    def move(self, moved):
+        self.stamps_ns.append(moved)
+
     def map(self):
         if self.stamps_ns[-1] % 2:
             raise ValueError("no memory for the map")
@@ -124,3 +127,14 @@ def test_a_map_that_does_not_change_is_waited_for_without_a_deadline(live_map, p
     add(live_map, 2, depth_m=DEPTH_M)
     assert published.wait(10.0) and has_waited.wait(10.0)
     assert waits_s == [None] * 2
+
+
+def test_what_was_drawn_is_moved_before_the_next_observation(live_map, mapper):
+    live_map.open(RIG)
+    add(live_map, 10, depth_m=DEPTH_M)
+    assert mapper.is_adding.wait(10.0)
+    mapper.is_adding.clear()
+    live_map.move(0)
+    live_map.add(Observation(stamp_ns=12, depth_m=DEPTH_M), se3.from_xy_yaw(10.0, 0.0, 0.0))
+    assert mapper.is_adding.wait(10.0)  # though the robot did not move
+    assert mapper.stamps_ns == [10, 0, 12]

@@ -26,7 +26,7 @@ from sceneslam.sinks.ros2 import sink as under_test
 from sceneslam.types import se3
 from sceneslam.types.command import Pause, SaveMap, SelectModule, SelectScene
 from sceneslam.types.errors import ConfigError
-from sceneslam.types.maps import GridLayer
+from sceneslam.types.maps import GridLayer, MovedMap
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Laser, Rig, Sensor
 
@@ -201,6 +201,18 @@ def test_diagnostics_say_who_tracks_and_how_well(air, sink):
     assert (status.level, status.message) == (0, "laser: tracking")
 
 
+def test_diagnostics_warn_while_the_robot_is_not_in_the_loaded_map(air, sink):
+    sink.write_event({"event": "tracking", "stamp_ns": S, "module": "laser", "status": "tracking"})
+    for second, (event, level) in enumerate(
+        [("not_relocalized", 1), ("relocalized", 0), ("relocalization_withdrawn", 1)]
+    ):
+        sink.write_event({"event": event, "stamp_ns": 2 * second * S})
+        sink.write(seen(2 * second * S, at(0.0)), at(0.0), "laser")
+        status = air.last("/diagnostics").status[0]
+        said = "laser: tracking, not found in the loaded map" if level else "laser: tracking"
+        assert (status.level, status.message) == (level, said)
+
+
 def test_path_stays_short_however_long_the_run(air, sink, monkeypatch):
     monkeypatch.setattr(topics, "_PATH_POSES", 10)
     for index in range(100):
@@ -209,6 +221,20 @@ def test_path_stays_short_however_long_the_run(air, sink, monkeypatch):
     assert 5 <= len(poses) <= 10 and poses[0].pose.position.x == 0.0
     steps = np.diff([pose.pose.position.x for pose in poses])
     np.testing.assert_allclose(steps, steps[0], atol=1e-6)
+
+
+def test_loops_move_the_path(air, sink):
+    sink.write(seen(0, at(0.0)), at(0.0), "laser")
+    sink.write(seen(S, at(1.0)), at(1.0), "laser")
+    ahead = {0: 0.0, S: 2.0}
+
+    def moved(stamps_ns, T_map_base):
+        return [at(ahead[ns]) @ T for ns, T in zip(stamps_ns.tolist(), T_map_base, strict=True)]
+
+    sink.write_map(MovedMap(grid=lambda: None, moved=moved))
+    sink.write(seen(3 * S, at(4.0)), at(4.0), "laser")
+    xs = [pose.pose.position.x for pose in air.last("/sceneslam/path").poses]
+    assert xs == [0.0, 3.0, 4.0]
 
 
 @pytest.mark.parametrize("frame", ["map", "odom_", "f", "longer/name", ""])

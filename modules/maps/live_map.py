@@ -9,17 +9,17 @@ from sceneslam.scans.depth_scan import DepthScanner, scan_frame
 from sceneslam.scans.occupancy_grid import OccupancyGrid
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.lens import undistorted_rays
-from sceneslam.types.maps import HybridMap, PointLayer
+from sceneslam.types.maps import HybridMap, MovedMap, PointLayer
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig, Sensor
-from sceneslam.types.se3 import Transform, apply
+from sceneslam.types.se3 import Transform, apply, inverse
 
 _KEY_BITS = 21  # of a voxel's index along each axis
 _UNSEEN_BGR = (160, 160, 160)  # of points without a camera
 
 
 class GridAndPoints:
-    """Adds every observation once; revised poses do not change the map."""
+    """Adds every observation once; loops and a loaded map move what was added."""
 
     sensors = frozenset({Sensor.SCAN, Sensor.DEPTH})
 
@@ -36,6 +36,9 @@ class GridAndPoints:
         self._rig, self._grid = rig, OccupancyGrid(self._resolution_m)
         self._keys = np.zeros(0, np.int64)  # of the voxels with a point, sorted
         self._points, self._colors = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
+        self._owners = np.zeros(0, np.int32)  # of each point: the depth image that it is from
+        self._stamps_ns: list[int] = []  # of these
+        self._poses: list[Transform] = []  # T_map_base
         self._scanner: DepthScanner | None = None
         if rig.camera is not None:  # with the paper's range of heights
             self._scanner = DepthScanner(rig.camera, beams=180, stride_px=2)
@@ -50,6 +53,22 @@ class GridAndPoints:
             self._grid.insert(T_map_base @ scan_frame(camera), scan)
         if observation.depth_m is not None and camera is not None:
             self._add_depth(observation, T_map_base)
+
+    def move(self, moved: MovedMap) -> None:
+        """Move the points with the poses that they were seen from; the grid is drawn anew."""
+        grid = moved.grid()
+        if grid is not None:
+            self._grid = OccupancyGrid.of(grid, self._resolution_m)
+        if not self._poses:
+            return
+        before = np.array(self._poses)
+        after = moved.moved(np.array(self._stamps_ns, np.int64), before)
+        T_new_old = (after @ inverse(before))[self._owners]
+        points = np.einsum("nij,nj->ni", T_new_old[:, :3, :3], self._points) + T_new_old[:, :3, 3]
+        colors, owners, self._poses = self._colors, self._owners, list(after)
+        self._keys, self._points = self._keys[:0], self._points[:0]
+        self._colors, self._owners = colors[:0], owners[:0]
+        self._add_points(points.astype(np.float32), colors, owners)
 
     def map(self) -> HybridMap:
         """Return a copy of the map."""
@@ -79,10 +98,18 @@ class GridAndPoints:
         colors = np.full((len(points), 3), _UNSEEN_BGR, np.uint8)
         if observation.image_bgr is not None:
             colors = observation.image_bgr[rows, columns]
-        self._add_points(points, colors)
+        owners = np.full(len(points), len(self._poses), np.int32)
+        self._stamps_ns.append(observation.stamp_ns)
+        self._poses.append(T_map_base)
+        self._add_points(points, colors, owners)
 
-    def _add_points(self, points: NDArray[np.float32], colors: NDArray[np.uint8]) -> None:
-        """Add the points (N, 3) [m], map, of empty voxels, with colours (N, 3)."""
+    def _add_points(
+        self,
+        points: NDArray[np.float32],
+        colors: NDArray[np.uint8],
+        owners: NDArray[np.int32],
+    ) -> None:
+        """Add the points (N, 3) [m], map, of empty voxels, with colours (N, 3) and owners (N,)."""
         cells = np.floor(points / self._voxel_m).astype(np.int64) + (1 << (_KEY_BITS - 1))
         keys = (cells[:, 0] << 2 * _KEY_BITS) | (cells[:, 1] << _KEY_BITS) | cells[:, 2]
         keys, first = np.unique(keys, return_index=True)
@@ -90,3 +117,4 @@ class GridAndPoints:
         self._keys = np.union1d(self._keys, keys[is_new])
         self._points = np.concatenate([self._points, points[first[is_new]]])
         self._colors = np.concatenate([self._colors, colors[first[is_new]]])
+        self._owners = np.concatenate([self._owners, owners[first[is_new]]])

@@ -23,7 +23,7 @@ from sceneslam.atlas.uncertainty import VELOCITY, Covariance, of_wheels
 from sceneslam.interfaces import TrajectoryLog
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError, InputError, text_of
-from sceneslam.types.maps import HybridMap, MapLayers
+from sceneslam.types.maps import HybridMap, MapLayers, MovedMap
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig, Wheels
 from sceneslam.types.run import BRIDGED, Note, Session, SessionStart
@@ -31,6 +31,7 @@ from sceneslam.types.se3 import Transform, Vector
 from sceneslam.types.trajectory import Trajectory
 
 _log = logging.getLogger(__name__)
+_SEEN_M, _SEEN_RAD = 0.05, 0.01  # a cell of the grid; the same 5 m away
 
 
 class Atlas:
@@ -54,7 +55,8 @@ class Atlas:
         self._lasting = LastingMap(load=load, save=save, mode=mode, save_every_s=save_every_s)
         self._mapper: Mapper | None = None  # None while only poses are given
         self._note: Note | None = None
-        self._correction = Correction.none()
+        self._correction = self._shown = Correction.none()
+        self._shows_loaded = False  # since the map was shown last
         self._is_over = False  # the correction is of the poses as revised, before: as told
         self._voxel_m = voxel_m
         self._sessions: list[OpenSession] = []
@@ -217,11 +219,15 @@ class Atlas:
         session = len(self._sessions) - 1
         self._path.add(stamp_ns, T_map_base, module, session, covariance, map_covariance)
 
-    def rewind(self, stamp_ns: int) -> None:
-        """Remove the poses from an instant on, to be replaced; `online` keeps them."""
+    def rewind(self, stamp_ns: int, T_new_told: Transform | None = None) -> None:
+        """Remove the poses from an instant on, to be replaced; `online` keeps them.
+
+        `T_new_told` (4, 4): how the module has corrected the last pose left since that was added,
+        where the session goes on from it; None: another session begins.
+        """
         if self._journal is not None:
-            self._journal.add_rewind(stamp_ns)
-        self._path.cut(stamp_ns)
+            self._journal.add_rewind(stamp_ns, T_new_told)
+        self._path.cut(stamp_ns, T_new_told)
         self._correction = self._correction.cut(stamp_ns)
         if self._mapper is not None:
             try:
@@ -248,6 +254,30 @@ class Atlas:
         if self.last_stamp_ns != stamp_ns:
             return None
         return self._in_map(self._path.poses[-1])
+
+    def take_moved(self) -> MovedMap | None:
+        """Return the map if loops or a loaded map have moved it visibly since the last call."""
+        mapper, was, now = self._mapper, self._shown, self._correction
+        if mapper is None or now is was:
+            return None
+        path = self._path
+        rows = np.searchsorted(path.stamps_ns[:-1], now.stamps_ns)
+        T_run_base = np.reshape([path.poses[row] for row in rows], (-1, 4, 4))
+        T_was_base, T_now_base = (one.apply(now.stamps_ns, T_run_base) for one in (was, now))
+        off = se3.inverse(T_was_base) @ T_now_base
+        is_seen = np.linalg.norm(off[:, :3, 3], axis=1) > _SEEN_M
+        is_seen |= se3.rotation_angle_rad(off) > _SEEN_RAD
+        if not is_seen.any() and mapper.is_placed == self._shows_loaded:
+            return None
+        self._shown, self._shows_loaded = now, mapper.is_placed
+
+        def moved(
+            stamps_ns: NDArray[np.int64], T_map_base: NDArray[np.float64]
+        ) -> NDArray[np.float64]:
+            T_was_run = was.apply(stamps_ns, np.tile(se3.identity(), (len(stamps_ns), 1, 1)))
+            return now.apply(stamps_ns, se3.inverse(T_was_run) @ T_map_base)
+
+        return MovedMap(grid=mapper.shown(now), moved=moved)
 
     @property
     def last_covariance(self) -> Covariance | None:
@@ -393,4 +423,5 @@ class Atlas:
             np.array(self._path.poses).reshape(-1, 4, 4),
             np.array(self._path.begun, np.int64),
             np.array(self._path.modules) == BRIDGED,
+            self._path.moved,
         )

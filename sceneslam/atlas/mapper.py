@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.atlas.lasting.saved_map import SavedMap, empty_map
+from sceneslam.atlas.places.floor_plan import grid_of, join
 from sceneslam.atlas.places.localizer import Look, MapLocalizer
 from sceneslam.atlas.places.map_search import MapSearch
 from sceneslam.atlas.places.view_taker import ViewTaker
@@ -33,7 +34,7 @@ from sceneslam.graphs.edge import Edge
 from sceneslam.scans.key_scan import KeyScan, KeyScanner
 from sceneslam.types import planar, se3
 from sceneslam.types.errors import InputError, text_of
-from sceneslam.types.maps import MapLayers
+from sceneslam.types.maps import GridLayer, MapLayers
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.run import Note
@@ -275,6 +276,24 @@ class Mapper:
         )
         saved = saved.without_guesses()
         return saved.without_misfits() if self._is_over else saved
+
+    def shown(self, correction: Correction) -> Callable[[], GridLayer | None]:
+        """Return what draws the map so far, in any thread: its walls, where poses are corrected.
+
+        With the loaded map, if the run is located in it; None if there is nothing to draw.
+        """
+        submaps, T_run_node = self._collector.grown()
+        stamps_ns = np.array([submap.stamps_ns[0] for submap in submaps], np.int64)
+        plane = planar.from_transforms(correction.apply(stamps_ns, T_run_node))
+
+        def grid() -> GridLayer | None:
+            before = self._loaded.plans() if is_placed else []
+            own = [(T, submap.plan) for T, submap in zip(plane, submaps, strict=True)]
+            plan = join([*before, *own], newest_wins=True)
+            return grid_of(plan) if len(plan) or plan.free.any() else None
+
+        is_placed = self.is_placed
+        return grid
 
     def _own_pieces(self, loops: Sequence[Edge]) -> NDArray[np.int64]:
         """Return the piece of each submap of the run, by the parts that loops join.

@@ -11,9 +11,10 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneslam.interfaces import CovarianceSink, ResultSink, Sink, Steering
+from sceneslam.interfaces import CovarianceSink, MapSink, ResultSink, Sink, Steering
 from sceneslam.types.command import Command
 from sceneslam.types.errors import InputError, calling
+from sceneslam.types.maps import MovedMap
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig
 from sceneslam.types.run import Event, RunResult
@@ -72,6 +73,18 @@ class OpenSinks:
                 if isinstance(sink, CovarianceSink) and covariance is not None:
                     sink.write_covariance(observation.stamp_ns, covariance)
                 sink.write(observation, T_map_base, module)
+
+    @property
+    def show_maps(self) -> bool:
+        """Tell whether any sink shows a map while the run goes on."""
+        return any(isinstance(sink, MapSink) for sink in self._sinks.values())
+
+    def write_map(self, moved: MovedMap) -> None:
+        """Pass where loops or a loaded map have moved the map."""
+        for key, sink in list(self._sinks.items()):
+            with self._dropping(key):
+                if isinstance(sink, MapSink):
+                    sink.write_map(moved)
 
     def write_events(self, events: Sequence[Event]) -> None:
         """Pass events to all sinks, to each a copy of its own."""

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
+from sceneslam.types.grid_frames import in_frame
 from sceneslam.types.maps import GridLayer, ScanLayer
 from sceneslam.types.observation import LaserScan
 
@@ -106,6 +107,14 @@ class OccupancyGrid:
         self._cells_max = cells_max
         self._cells = np.zeros((0, 0), dtype=np.int8)  # log odds in steps
         self._origin = np.zeros(2, dtype=np.int64)  # cell (column, row) of the array's corner
+
+    @classmethod
+    def of(cls, layer: GridLayer, resolution_m: float) -> OccupancyGrid:
+        """Return a grid that goes on from a layer, with cells of its own size."""
+        grid, layer = cls(resolution_m), in_frame(se3.identity(), layer, cell_m=resolution_m)
+        grid._cells = np.clip(np.rint(layer.log_odds / _STEP), -127, 127).astype(np.int8)
+        grid._origin = np.rint(np.array(layer.origin_xy_m) / resolution_m).astype(np.int64)
+        return grid
 
     def insert(self, T_local_laser: se3.Transform, scan: LaserScan) -> None:
         """Add a scan at T_local_laser (4, 4) [m], projected to the xy plane."""

@@ -12,7 +12,7 @@ import numpy as np
 from sceneslam.interfaces import LiveMapper
 from sceneslam.types import se3
 from sceneslam.types.errors import text_of
-from sceneslam.types.maps import HybridMap, PointLayer
+from sceneslam.types.maps import HybridMap, MovedMap, PointLayer
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig
 from sceneslam.types.se3 import Transform
@@ -37,6 +37,7 @@ class LiveMap:
         self._waiting: tuple[Observation, Transform, Transform] | None = None
         self._trail = Trail()
         self._T_map_drawn: Transform | None = None
+        self._moved: list[MovedMap] = []  # that wait, oldest first
         self._newest = NOTHING
         self._is_closed = False
         self._error: Exception | None = None  # the first one
@@ -47,7 +48,7 @@ class LiveMap:
         """Start with an empty map."""
         self._mapper.open(rig)
         self._is_closed, self._newest, self._T_map_drawn = False, NOTHING, None
-        self._trail = Trail()
+        self._trail, self._waiting, self._moved = Trail(), None, []
         self._thread = threading.Thread(target=self._draw, name="map", daemon=True)
         self._thread.start()
 
@@ -63,6 +64,13 @@ class LiveMap:
             T_map_then = T_map_base @ self._trail.base_at(scan.stamp_ns)
         with self._changed:
             self._waiting = (observation, T_map_base, T_map_then)
+            self._changed.notify()
+
+    def move(self, moved: MovedMap) -> None:
+        """Queue a correction of what was drawn; the next observation is drawn in any case."""
+        with self._changed:
+            self._waiting, self._T_map_drawn = None, None
+            self._moved.append(moved)
             self._changed.notify()
 
     def newest(self) -> HybridMap:
@@ -93,14 +101,22 @@ class LiveMap:
         while True:
             with self._changed:
                 wait_s = due_s - monotonic() if is_changed else None
-                self._changed.wait_for(lambda: self._waiting or self._is_closed, wait_s)
+                self._changed.wait_for(
+                    lambda: self._waiting or self._moved or self._is_closed, wait_s
+                )
                 waiting, self._waiting = self._waiting, None
+                moved, self._moved = self._moved, []
             if self._is_closed:
                 return
             try:
+                for each in moved:
+                    self._mapper.move(each)
+                    is_changed = True
                 if waiting is not None:
                     self._mapper.add(*waiting)
-                    self._T_map_drawn, is_changed = waiting[1], True
+                    with self._changed:
+                        self._T_map_drawn = None if self._moved else waiting[1]
+                    is_changed = True
                 if is_changed and monotonic() >= due_s:
                     due_s, is_changed = monotonic() + self._every_s, False
                     self._newest = self._mapper.map()

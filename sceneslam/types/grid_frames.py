@@ -13,13 +13,16 @@ from sceneslam.types.maps import GridLayer
 from sceneslam.types.se3 import Transform
 
 
-def in_frame(T_frame_local: Transform, grid: GridLayer) -> GridLayer:
+def in_frame(
+    T_frame_local: Transform, grid: GridLayer, *, cell_m: float | None = None
+) -> GridLayer:
     """Return a grid in the axes of `frame`: the nearest cells, and every occupied one.
 
-    T_frame_local (4, 4) [m] counts by x, y and yaw. The grid is copied only if it has a yaw.
+    T_frame_local (4, 4) [m] counts by x, y and yaw. The grid is copied only if it has a yaw, or
+    with cells of another size `cell_m`.
     """
-    T, cell_m = _planar(T_frame_local), grid.resolution_m
-    if np.array_equal(T[:2, :2], np.eye(2)):
+    T, cell_m = _planar(T_frame_local), grid.resolution_m if cell_m is None else cell_m
+    if np.array_equal(T[:2, :2], np.eye(2)) and cell_m == grid.resolution_m:
         x_m, y_m = (T[:2, 3] + grid.origin_xy_m).tolist()
         return replace(grid, origin_xy_m=(x_m, y_m))
     corners = grid_corners(T, grid)
@@ -27,9 +30,9 @@ def in_frame(T_frame_local: Transform, grid: GridLayer) -> GridLayer:
     columns, rows = (np.ceil(corners.max(axis=0) / cell_m) - low).astype(int).tolist()
     x_m, y_m = (low * cell_m).tolist()
     log_odds = resampled(T, grid, (x_m, y_m), cell_m, (columns, rows))
-    # A rotated cell may lie between the centres of all new ones: what stands there must not vanish.
+    # An old cell may lie between the centres of all new ones: what stands there must not vanish.
     occupied = np.argwhere(grid.log_odds > 0)[:, ::-1]
-    centres = (occupied + 0.5) * cell_m + grid.origin_xy_m
+    centres = (occupied + 0.5) * grid.resolution_m + grid.origin_xy_m
     column, row = np.floor((centres @ T[:2, :2].T + T[:2, 3]) / cell_m - low).astype(int).T
     np.maximum.at(log_odds, (row, column), grid.log_odds[occupied[:, 1], occupied[:, 0]])
     return GridLayer(log_odds=log_odds, resolution_m=cell_m, origin_xy_m=(x_m, y_m))

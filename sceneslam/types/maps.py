@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -112,3 +113,12 @@ class HybridMap:
 
 def _log_odds(probability: float) -> float:
     return float(np.log(probability / (1.0 - probability)))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MovedMap:
+    """Where loops, or a loaded map, have moved what was drawn of a run. In `map`, in any thread."""
+
+    grid: Callable[[], GridLayer | None]  # draws the map so far, None: no sensor saw walls
+    # Where poses (N, 4, 4) of these stamps (N,), as they were reported, are now.
+    moved: Callable[[NDArray[np.int64], NDArray[np.float64]], NDArray[np.float64]]

@@ -18,7 +18,7 @@ from sceneslam.types import se3
 from sceneslam.types.command import Command, SaveMap
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.grid_frames import in_frame
-from sceneslam.types.maps import HybridMap
+from sceneslam.types.maps import HybridMap, MovedMap
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.run import Event, RunResult
@@ -41,6 +41,11 @@ TYPES = {
 _SLOW_NS = 1_000_000_000  # period of path and diagnostics
 _PATH_POSES = 2000  # largest number; beyond, every second one is left out
 _LEVELS = {"tracking": OK, "degraded": WARN}
+_PLACES = {  # event -> what it says of the loaded map
+    "relocalized": "",
+    "not_relocalized": "not found in the loaded map",
+    "relocalization_withdrawn": "not found in the loaded map",
+}
 
 
 class TopicSink:
@@ -97,7 +102,7 @@ class TopicSink:
         self._path_step = 1  # every so many poses, one is in the path
         self._count, self._slow_ns = 0, -_SLOW_NS
         self._said = dict.fromkeys((SCENE, MODULE), "")
-        self._status, self._reason = "", ""
+        self._status, self._reason, self._place = "", "", ""
         self._live_map.open(rig)
 
     def commands(self) -> Sequence[Command]:
@@ -118,7 +123,7 @@ class TopicSink:
         stamp_ns = observation.stamp_ns - self._shift_ns
         covariance, self._covariance = self._covariance, None
         if T_map_base is not None:
-            self._place(T_map_base)
+            self._place_frame(T_map_base)
             T_frame_base = self._T_frame_map @ T_map_base
             self._send_transform(stamp_ns, T_frame_base, observation.T_odom_base)
             odometry = self.encoder.odometry(
@@ -138,6 +143,13 @@ class TopicSink:
             self._send_path()
             self._send_health(stamp_ns, module)
 
+    def write_map(self, moved: MovedMap) -> None:
+        """Correct what was drawn of the map, and the path."""
+        self._live_map.move(moved)
+        if self._poses:
+            stamps_ns = np.array(self._stamps_ns, np.int64) + self._shift_ns
+            self._poses = list(moved.moved(stamps_ns, np.array(self._poses)))
+
     def write_event(self, event: Event) -> None:
         """Publish scene and module when they change."""
         kind = event["event"]
@@ -147,6 +159,8 @@ class TopicSink:
             self._status = str(event["status"])
         elif kind == "decision":
             self._reason = f"{event['to']}: {event['reason']}"
+        elif kind in _PLACES:
+            self._place = _PLACES[kind]
         elif kind == "clock_jump" and event["paces"]:
             self._shift_ns = int(event["shift_ns"])
         elif kind == "odometry_jump":
@@ -173,7 +187,7 @@ class TopicSink:
                 self._transport.close()
                 self._transport = None
 
-    def _place(self, T_map_base: Transform) -> None:
+    def _place_frame(self, T_map_base: Transform) -> None:
         """Move the published `map` so that the robot has the pose of `/initialpose`."""
         T_frame_base = self._requests.placed()
         if T_frame_base is not None:
@@ -210,6 +224,8 @@ class TopicSink:
     def _send_health(self, stamp_ns: int, module: str) -> None:
         level = _LEVELS.get(self._status, ERROR)
         message = f"{module}: {self._status}" if module else "no module runs"
+        if self._place:
+            level, message = max(level, WARN), f"{message}, {self._place}"
         values = {
             "scene": self._said[SCENE],
             "module": module,

@@ -1,0 +1,101 @@
+"""The map during a run, where loops and a loaded map have moved it."""
+
+import cv2
+import numpy as np
+import pytest
+from test_one_map import atlas, world
+
+from sceneslam.atlas.lasting.map_files import load_map_files
+from sceneslam.atlas.places.floor_plan import grid_of
+from sceneslam.experiments.one_map.drive import RIG, Drive, Odometry
+from sceneslam.modules.maps.live_map import GridAndPoints
+from sceneslam.scans.occupancy_grid import OccupancyGrid
+from sceneslam.testing.floor_plans import FLAT_TOUR, flat, through
+from sceneslam.types import se3
+from sceneslam.types.grid_frames import resampled
+from sceneslam.types.maps import GridLayer, MovedMap
+from sceneslam.types.observation import Observation
+from sceneslam.types.rig import Camera, Rig, Sensor
+
+
+class Shown:
+    """An atlas whose map is shown as a sink does it."""
+
+    def __init__(self, shown):
+        self._atlas = shown
+        self.mapper = GridAndPoints(resolution_m=0.05, voxel_m=0.05, depth_stride_px=8)
+        self.mapper.open(RIG)
+
+    def __getattr__(self, name):
+        return getattr(self._atlas, name)
+
+    def observe(self, observation, up_base):
+        self._atlas.observe(observation, up_base)
+        moved = self._atlas.take_moved()
+        if moved is not None:
+            self.mapper.move(moved)
+        T_map_base = self._atlas.pose_at(observation.stamp_ns)
+        self.mapper.add(observation, T_map_base, T_map_base)
+
+
+def shares(shown, final):
+    """Return the share of the walls shown that the final grid has, and the other way round."""
+    size = final.log_odds.shape[::-1]
+    grid = shown.mapper.map().grid
+    seen = resampled(se3.identity(), grid, final.origin_xy_m, final.resolution_m, size) > 0
+    due = final.log_odds > 0
+    near = [cv2.dilate(walls.astype(np.uint8), np.ones((3, 3))) > 0 for walls in (due, seen)]
+    return np.mean(near[0][seen]), np.mean(near[1][due])
+
+
+def test_a_run_that_is_found_shows_the_loaded_map_around_it(tmp_path):
+    made = Drive(atlas(save=str(tmp_path / "map"))).go(world(flat()), through(FLAT_TOUR))
+    assert made.faults == []
+    shown = Shown(atlas(load=str(tmp_path / "map")))
+    true = through([(7.3, 0.9), (9.2, 1.0), (9.3, 2.0), (5.2, 2.0)])
+    assert Drive(shown).go(world(flat(), 5), true).of_kind("relocalized")
+    right, found = shares(shown, shown.fuse_maps().grid)
+    assert right > 0.99 and found > 0.95  # as reported then, without the loaded map: 0.81, 0.81
+
+
+def test_loops_move_the_walls_that_are_shown(tmp_path):
+    shown = Shown(atlas(save=str(tmp_path / "map")))
+    true = np.concatenate([through(FLAT_TOUR), through(FLAT_TOUR)])
+    odometry = Odometry(scale=0.03, turn_rad_per_m=0.006)
+    drive = Drive(shown, turn_deviation=0.006).go(world(flat()), true, odometry=odometry)
+    assert drive.of_kind("loop")
+    right, found = shares(shown, grid_of(load_map_files(tmp_path / "map").plan()))
+    assert right > 0.99 and found > 0.88  # as reported then: 0.94, 0.865
+
+
+def test_points_move_with_the_poses_that_they_were_seen_from():
+    mapper = GridAndPoints(resolution_m=0.05, voxel_m=0.05, depth_stride_px=1)
+    camera = Camera(fx=10.0, fy=10.0, cx=1.0, cy=1.0, size_wh=(3, 3))
+    mapper.open(Rig(sensors=frozenset({Sensor.DEPTH}), camera=camera))
+    poses = [se3.from_xy_yaw(x_m, 0.0, 0.0) for x_m in (0.0, 10.0)]
+    for stamp_ns, pose in enumerate(poses):
+        mapper.add(Observation(stamp_ns=stamp_ns, depth_m=np.ones((3, 3), np.float32)), pose, pose)
+    before = mapper.map().points.points
+    T_new_old = np.array([np.eye(4), se3.from_xy_yaw(0.0, 3.0, 0.0)])
+
+    def moved(stamps_ns, T_map_base):
+        return T_new_old[stamps_ns] @ T_map_base
+
+    for _ in range(2):  # the second time, it starts from where they are
+        mapper.move(MovedMap(grid=lambda: None, moved=moved))
+    after = mapper.map().points.points
+    is_second = before[:, 0] > 5.0
+    expected = before + np.where(is_second, 6.0, 0.0)[:, None] * [0.0, 1.0, 0.0]
+    order, due = np.lexsort(after.T), np.lexsort(expected.T)
+    np.testing.assert_allclose(after[order], expected[due], atol=1e-5)
+
+
+@pytest.mark.parametrize("cell_m", [0.05, 0.02, 0.1, 0.2])
+def test_a_wall_stays_in_a_grid_with_cells_of_another_size(cell_m):
+    log_odds = np.full((40, 40), -3.0, np.float32)
+    log_odds[11] = 3.0
+    layer = GridLayer(log_odds=log_odds, resolution_m=0.05, origin_xy_m=(-1.0, 2.0))
+    grid = OccupancyGrid.of(layer, cell_m).layer()
+    row = int(np.floor((2.0 + 11.5 * 0.05 - grid.origin_xy_m[1]) / cell_m + 1e-9))
+    assert (grid.log_odds[row, : int(2.0 / cell_m)] > 2.9).all()
+    assert (grid.log_odds < -2.9).sum() > 0.7 * grid.log_odds.size
