@@ -205,21 +205,65 @@ def test_a_target_is_made_once_for_all_that_are_compared_with_it(monkeypatch):
         assert len(compared.targets) == made
 
 
+def query_along(nodes):
+    """The query for the last node of a run that measured the motions from node to node."""
+    steps = [se3.inverse(a) @ b for a, b in pairwise(nodes)]
+    motions = [replace(edge(k, k + 1), T_first_second=step) for k, step in enumerate(steps)]
+    chain = Chain(
+        submaps=[submap(0)] * len(nodes),
+        T_run_node=nodes,
+        motions=motions,
+        drift=list(0.1 * np.arange(len(nodes))[:, None, None] * [[1.0, 1.0, 0.1], [0.0] * 3]),
+    )
+    return LoopQuery.of(chain, len(nodes) - 1)
+
+
 @pytest.mark.parametrize(("tilt_rad", "is_on_floor"), [(0.0, True), (0.15, False)])
 def test_a_loop_by_plans_has_the_tilt_of_a_sensor_that_is_carried_by_hand(tilt_rad, is_on_floor):
     rng, count = np.random.default_rng(0), 12
     flat = transforms([[2.0 * np.cos(k), 2.0 * np.sin(k), k] for k in range(count)])
     tilts = tilt_rad * rng.uniform(-1.0, 1.0, (count, 6)) * [0.0, 0.0, 0.3, 1.0, 1.0, 0.0]
     nodes = [T @ se3.exp(tilt) for T, tilt in zip(flat, tilts, strict=True)]
-    steps = [se3.inverse(a) @ b for a, b in pairwise(nodes)]
-    motions = [replace(edge(k, k + 1), T_first_second=step) for k, step in enumerate(steps)]
-    chain = Chain(
-        submaps=[submap(0)] * count,
-        T_run_node=nodes,
-        motions=motions,
-        drift=[np.zeros((2, 3))] * count,
-    )
-    query = LoopQuery.of(chain, count - 1)
+    query = query_along(nodes)
     found = query.on_plane(2, planar.between(query.plane[2], query.plane[-1]))
-    assert query.is_on_floor == is_on_floor
+    assert (query.floor_normal is not None) == is_on_floor
     np.testing.assert_allclose(found, se3.inverse(nodes[2]) @ nodes[-1], atol=1e-9)
+
+
+def test_plans_tell_height_and_tilt_on_a_floor_and_neither_by_hand(monkeypatch):
+    pitch, roll = np.array([0, 0, 0, 0, -0.1, 0.0]), np.array([0, 0, 0, 0.2, 0, 0.0])
+    tilt = se3.exp(pitch) @ se3.exp(roll)  # keeps the yaw
+    flat = [se3.from_xy_yaw(np.cos(k), np.sin(k), k) for k in range(8)]
+    plane = np.diag([0.02, 0.03, 0.005]) ** 2
+    level = planar.spatial_covariance(plane, level=np.array([0.05, 0.02, 0.02]) ** 2)
+    np.testing.assert_allclose(query_along(flat).spatial(plane), level)
+    held = query_along([*flat[::2], *(T @ tilt for T in flat[1::2])])
+    along = se3.carried(held.spatial(plane), tilt)  # in axes that are level
+    open_level = planar.spatial_covariance(plane, level=np.array([1.0, 0.3, 0.3]) ** 2)
+    np.testing.assert_allclose(along, open_level, atol=1e-12)
+    Compared(monkeypatch)
+    loop, *_ = finder_of([]).loops_to(held)
+    np.testing.assert_allclose(loop.covariance, held.spatial(quality().covariance))
+
+
+@pytest.mark.parametrize("pitch_rad", [0.01, 0.02, 0.15])
+@pytest.mark.parametrize("corners", [[0, 1, 2, 3], [0, 1, 1, 1, 1, 2, 3, 3, 3, 3]])
+def test_a_loop_by_plans_closes_the_climb_of_a_base_that_is_mounted_askew(pitch_rad, corners):
+    """Rounds of a rectangle by odometry that climbs 1 %, in the map that its first pose begins."""
+    mount, step_m = se3.exp(np.array([0.0, 0.0, 0.0, 0.0, pitch_rad, 0.0])), 2.0
+    true, climbing = [np.eye(4)], [np.eye(4)]
+    for corner in (corners * 3)[: 2 * len(corners) + 2]:
+        yaw_rad = 0.5 * np.pi * corner - planar.from_transform(true[-1])[2]
+        step = se3.from_xy_yaw(0.0, 0.0, yaw_rad) @ se3.from_xy_yaw(step_m, 0.0, 0.0)
+        true.append(true[-1] @ step)
+        step[2, 3] = 0.01 * step_m
+        climbing.append(climbing[-1] @ step)
+    T_map_level = se3.inverse(mount)
+    query = query_along([T_map_level @ T @ mount for T in climbing])
+    first = len(true) - 1 - len(corners)
+    T_first_second = planar.between(query.plane[first], query.plane[-1])
+    found = mount @ query.on_plane(first, T_first_second) @ T_map_level
+    due = se3.inverse(true[first]) @ true[-1]
+    off = se3.log(se3.inverse(due) @ found)
+    assert np.abs(off[2]) < 2e-6  # the odometry is off by 0.08 and 0.2 m
+    assert np.abs(off[3:5]).max() < 1e-9

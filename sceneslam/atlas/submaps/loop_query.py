@@ -10,19 +10,19 @@ from numpy.typing import NDArray
 
 from sceneslam.atlas.places.plan_search import SearchWindow
 from sceneslam.atlas.submaps.chain import Chain
+from sceneslam.atlas.submaps.graph import on_floor
 from sceneslam.atlas.submaps.path_drift import PathDrift
 from sceneslam.atlas.submaps.submap import Submap
-from sceneslam.atlas.submaps.uprights import are_on_floor, usual_up
+from sceneslam.atlas.submaps.uprights import by_hand, floor_normal, tilt
+from sceneslam.motion.tilt import upright
 from sceneslam.types import planar, se3
-from sceneslam.types.planar import Planar
-from sceneslam.types.se3 import Transform
+from sceneslam.types.planar import Matrix, Planar
+from sceneslam.types.se3 import Transform, Vector
 
 SIGMAS = 3.0  # of the drift: search range
 GAIN_MIN_M = SIGMAS * 0.02  # a smaller range: recognition cannot improve on so little drift
 NEIGHBOURS = 2  # neighbouring submaps on either side in a target
 TARGETS = 3  # per submap: three loops to different places outvote a wrong one
-
-_UP = np.array([0.0, 0.0, 1.0])
 
 # Tells whether a loop may lead from a submap to a later one.
 MayClose = Callable[[int, int, Sequence[Submap]], bool]
@@ -41,21 +41,20 @@ class LoopQuery:
     T_run_node: NDArray[np.float64]  # (N, 4, 4)
     plane: NDArray[np.float64]  # (N, 3), the nodes in the plane [m, m, rad]
     drift: PathDrift
-    is_on_floor: bool  # as a robot is, not carried by hand
+    floor_normal: Vector | None  # (3,), in base; None: base is carried by hand
     starts: Sequence[int]  # with these a piece begins: the motion to them is hardly known
 
     @classmethod
     def of(cls, chain: Chain, second: int) -> LoopQuery:
         """Return the query for a submap of a chain."""
         nodes = np.array(chain.T_run_node)
-        up_run = usual_up(chain.submaps, nodes, _UP)
         return cls(
             second=second,
             submaps=chain.submaps,
             T_run_node=nodes,
             plane=planar.from_transforms(chain.T_run_node),
             drift=PathDrift.of(chain.drift),
-            is_on_floor=are_on_floor(chain.motions, nodes, _UP, up_run),
+            floor_normal=floor_normal(chain.motions, nodes, chain.submaps),
             starts=chain.starts,
         )
 
@@ -88,12 +87,20 @@ class LoopQuery:
 
         On a floor height and tilt do not change; by hand they do as the motions alone say.
         """
-        if self.is_on_floor:
-            return planar.to_transform(T_first_second)
+        if self.floor_normal is not None:
+            T_level_base = upright(se3.identity(), self.floor_normal)
+            T_base_level = se3.inverse(T_level_base)
+            return np.asarray(T_base_level @ planar.to_transform(T_first_second) @ T_level_base)
         lies, found = self.plane[self.second], planar.compose(self.plane[first], T_first_second)
         T_found_lies = planar.to_transform(found) @ se3.inverse(planar.to_transform(lies))
         T_run_second = T_found_lies @ self.T_run_node[self.second]
         return np.asarray(se3.inverse(self.T_run_node[first]) @ T_run_second)
+
+    def spatial(self, covariance: Matrix) -> NDArray[np.float64]:
+        """Return the covariance (6, 6) of a motion to the submap from that in the plane (3, 3)."""
+        if self.floor_normal is not None:
+            return on_floor(covariance)
+        return by_hand(covariance, tilt(self.T_run_node[self.second]))
 
     def window(self, first: int) -> SearchWindow:
         """Return where the submap may lie in the frame of an earlier one."""

@@ -7,7 +7,6 @@ import numpy as np
 from sceneslam.atlas.places.floor_plan import FloorPlan, join
 from sceneslam.atlas.places.plan_field import PlanField
 from sceneslam.atlas.places.recognition import Recognizer
-from sceneslam.atlas.submaps.graph import on_floor
 from sceneslam.atlas.submaps.loop_query import GAIN_MIN_M, NEIGHBOURS, TARGETS, LoopQuery, MayClose
 from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.types import planar
@@ -47,7 +46,7 @@ class PlanLoops:
                     first=first,
                     second=query.second,
                     T_first_second=query.on_plane(first, match.T_target_query),
-                    covariance=on_floor(match.covariance),
+                    covariance=query.spatial(match.covariance),
                     kind=EdgeKind.LOOP,
                 )
             )

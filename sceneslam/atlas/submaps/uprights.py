@@ -13,8 +13,13 @@ from sceneslam.atlas.submaps.graph import UPRIGHT_RAD, Upright
 from sceneslam.atlas.submaps.submap import Submap
 from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.motion.tilt import upright
-from sceneslam.types import se3
-from sceneslam.types.se3 import Vector
+from sceneslam.types import planar, se3
+from sceneslam.types.planar import Matrix
+from sceneslam.types.se3 import Transform, Vector
+
+_UP = np.array([0.0, 0.0, 1.0])
+_HEADINGS = 0.1**2  # rad^2: the tilt of modules drifts by 2 degrees, a third of such a spread
+_HELD = np.array([1.0, 0.3, 0.3]) ** 2  # m, rad: a hand lifts and tilts, and walls do not show it
 
 
 def straightened(chain: Chain) -> list[Submap]:
@@ -74,6 +79,47 @@ def are_on_floor(
     climbed_m = np.einsum("i,nij,nj->n", up_map, firsts, steps)
     uneven_m = UPRIGHT_RAD * np.linalg.norm(steps, axis=1)
     return bool((off_floor_m**2).sum() <= (climbed_m**2 + uneven_m**2).sum())
+
+
+def floor_normal(
+    edges: Sequence[Edge], T_map_node: NDArray[np.float64], submaps: Sequence[Submap]
+) -> Vector | None:
+    """Return the normal (3,) in base of the floor that motions lie in, None if carried by hand.
+
+    It is base's own z or, where base is mounted askew, the axis that it turns about.
+    """
+    for normal in (_UP, turning_axis(T_map_node)):
+        if are_on_floor(edges, T_map_node, normal, usual_up(submaps, T_map_node, normal)):
+            return normal
+    return None
+
+
+def turning_axis(T_map_node: NDArray[np.float64]) -> Vector:
+    """Return the direction (3,) in nodes (N, 4, 4) that changes least in the map.
+
+    It is their own z if their headings hardly differ.
+    """
+    mean = T_map_node[:, :3, :3].mean(axis=0)
+    spread = np.eye(3) - mean.T @ mean  # u' spread u: variance of a direction u in the map
+    x_y = np.linalg.solve(spread[:2, :2] + _HEADINGS * np.eye(2), -spread[:2, 2])
+    axis = np.append(x_y, 1.0)
+    return np.asarray(axis / np.linalg.norm(axis))
+
+
+def tilt(T_map_node: Transform) -> Transform:
+    """Return T_level_node (4, 4): roll and pitch of a pose without its part in the plane."""
+    T_map_level = planar.to_transform(planar.from_transform(T_map_node))
+    T_level_node = se3.inverse(T_map_level) @ T_map_node
+    return se3.from_parts(T_level_node[:3, :3], np.zeros(3))
+
+
+def by_hand(covariance: Matrix, T_level_node: Transform) -> NDArray[np.float64]:
+    """Return the covariance (6, 6) of a node carried by hand from that in the plane (3, 3).
+
+    Height and tilt are open. It is in the axes of the node.
+    """
+    level = planar.spatial_covariance(covariance, level=_HELD)
+    return se3.carried(level, se3.inverse(T_level_node))
 
 
 def uprights(
