@@ -150,10 +150,12 @@ def test_a_submap_ends_after_its_length_its_turn_and_its_session():
     assert third.stamps_ns[0] == 11 * S
 
 
+@pytest.mark.parametrize("roll_rad", [0.0, 0.3])
 @pytest.mark.parametrize("pitch_rad", [0.0, 0.3])
-def test_a_submap_is_level_in_the_plane_however_its_first_pose_is_tilted(pitch_rad):
+def test_a_submap_is_level_in_the_plane_however_its_first_pose_is_tilted(pitch_rad, roll_rad):
     begun = at(1.0, 2.0, 0.5)
-    tilted = begun @ pitched(0.0, pitch_rad=pitch_rad)
+    rolled = se3.exp(np.array([0.0, 0.0, 0.0, roll_rad, 0.0, 0.0]))
+    tilted = begun @ pitched(0.0, pitch_rad=pitch_rad) @ rolled
     poses = [tilted, *(begun @ at(0.2 * k, 0.1, 0.3) for k in range(1, 10))]
     own = make_submap([key_pose(k, T) for k, T in enumerate(poses)], 0, se3.identity())
     due = [[0.2 * k, 0.1, 0.3] for k in range(1, 10)]

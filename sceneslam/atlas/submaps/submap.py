@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from sceneslam.atlas.places.floor_plan import FloorPlan, draw
 from sceneslam.atlas.uncertainty import Covariance, Drift, motions
-from sceneslam.motion.tilt import upright
 from sceneslam.scans.key_scan import KeyScan
 from sceneslam.types import planar, se3
 from sceneslam.types.covariance import grown
@@ -22,7 +21,6 @@ from sceneslam.views.view import Landmarks, LandmarkView, PlacedView
 LENGTH_M = 2.5  # length of path in a submap: by MAPPED it drifts 1 cm
 TURN_RAD = 2 * np.pi  # or this much turning, after which everything around was seen
 STEP_M, STEP_RAD = 0.1, 0.1  # between two scans of a submap
-_UP = np.array([0.0, 0.0, 1.0])
 LEAST = np.repeat([0.003, 0.002], 3)  # m, rad: least standard deviations between two submaps
 
 
@@ -87,8 +85,8 @@ class Submap:
 def make_submap(poses: Sequence[KeyPose], run: int, T_base_cam: Transform) -> Submap:
     """Return the submap of consecutive poses of one session, and what a camera saw there."""
     first = poses[0]
-    T_level_map = se3.inverse(upright(first.T_map_base, _UP))
-    T_submap_base = [planar.from_transform(T_level_map @ pose.T_map_base) for pose in poses]
+    on_plane = planar.from_transforms([pose.T_map_base for pose in poses])
+    T_submap_base = [planar.between(on_plane[0], each) for each in on_plane]
     placed = zip(T_submap_base, (pose.scan for pose in poses), strict=True)
     return Submap(
         run=run,
