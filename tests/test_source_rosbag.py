@@ -63,31 +63,62 @@ def test_all_storages_give_the_same_scans(shared_data: Path, name: str) -> None:
     assert source.ground_truth() is None
 
 
-def test_a_split_bag_is_read_as_one(tmp_path: Path) -> None:
-    """Parts as `rosbag record --split` names them."""
+def write_bags(folder: Path, begins_s: dict[str, int]) -> None:
+    """Write ROS 1 bags of three scans each, one per second."""
     store = get_typestore(Stores.ROS1_NOETIC)
     names = ("builtin_interfaces/msg/Time", "std_msgs/msg/Header", "sensor_msgs/msg/LaserScan")
     Time, Header, LaserScan = (store.types[name] for name in names)
-    for part in (10, 9):
-        with BagWriter(tmp_path / f"drive_{part}.bag") as writer:
+    for name, begin_s in begins_s.items():
+        with BagWriter(folder / f"{name}.bag") as writer:
             topic = writer.add_connection("/scan", LaserScan.__msgtype__, typestore=store)
-            for number in range(3 * part, 3 * part + 3):
+            for number in range(begin_s, begin_s + 3):
                 stamp = Time(sec=STAMP_NS // 10**9 + number, nanosec=STAMP_NS % 10**9)
                 limits = (-1.0, 1.0, 0.1, 0.0, 0.0, 0.1, 10.0)
                 ranges = (np.ones(21, np.float32), np.zeros(0, np.float32))
                 scan = LaserScan(Header(seq=0, stamp=stamp, frame_id="laser"), *limits, *ranges)
                 data = store.serialize_ros1(scan, LaserScan.__msgtype__)
                 writer.write(topic, STAMP_NS + number * 10**9, data)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("drive_9", "drive_10"),
+        ("2011-03-27-02-59-59_0", "2011-03-27-03-00-02_1"),
+        ("a_2011-10-30-02-59-59_0", "a_2011-10-30-02-00-02_1"),  # the end of summer time
+    ],
+)
+def test_a_split_bag_is_read_as_one(tmp_path: Path, names: tuple[str, str]) -> None:
+    """Parts as `rosbag record --split` names them."""
+    write_bags(tmp_path, {names[1]: 30, names[0]: 27})
     source = make_source("rosbag", tmp_path)
     stamps_ns = [STAMP_NS + number * 10**9 for number in range(27, 33)]
     assert [one.stamp_ns for one in source] == stamps_ns
     assert source.length == 6 and source.faults == []
 
 
-def test_bags_of_other_names_are_no_parts(tmp_path: Path) -> None:
-    for name in ("kitchen.bag", "garage.bag"):
-        (tmp_path / name).touch()
-    with pytest.raises(InputError, match=r"not parts of one bag, give one of garage\.bag, kitchen"):
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("garage", "kitchen"),
+        ("run1", "run2"),
+        ("2011-01-25-06-29-26", "2011-03-27-07-49-54"),
+        ("run1_0", "run2_1"),
+        ("run_0", "run_2"),
+        ("run_1", "run_01"),
+    ],
+)
+def test_bags_of_other_names_are_no_parts(tmp_path: Path, names: tuple[str, str]) -> None:
+    write_bags(tmp_path, dict(zip(names, (0, 3), strict=True)))
+    with pytest.raises(InputError, match="not parts of one bag, give one of") as caught:
+        make_source("rosbag", tmp_path)
+    assert all(f"{name}.bag" in str(caught.value) for name in names)
+
+
+@pytest.mark.parametrize("begin_s", [30, -30])
+def test_bags_that_do_not_follow_each_other_are_no_parts(tmp_path: Path, begin_s: int) -> None:
+    write_bags(tmp_path, {"run_1": 0, "run_2": begin_s})
+    with pytest.raises(InputError, match=r"give one of them: run_2\.bag begins -?\d+\.0 s after"):
         make_source("rosbag", tmp_path)
 
 

@@ -20,6 +20,8 @@ from sceneslam.types.errors import InputError, text_of
 from sceneslam.types.input_files import check_regular, files_by_number
 
 _FIRST_LOOK_BACK_NS = 2_000_000_000
+# Of `rosbag record --split`: prefix, date and number of the part, the first two or one of them.
+_PART = re.compile(r"(.*?)(?:\d{4}(?:-\d\d){5})?_(\d+)")
 
 
 def open_recording(path: Path) -> Recording:
@@ -55,15 +57,29 @@ def _open_folder(path: Path) -> Recording:
         raise InputError(f"recording: its metadata.yaml is missing; write it by `{how}`: {path}")
     bags = files_by_number(path, {".bag"})
     if not metadata.is_file() and bags:
-        if len({re.sub(r"\d+", "0", bag.stem) for bag in bags}) > 1:
-            names = ", ".join(bag.name for bag in bags)
-            raise InputError(f"recording: not parts of one bag, give one of {names}: {path}")
-        return open_bags(bags)
+        return open_bags(_parts(bags, path))
     if not metadata.is_file():
         raise InputError(
             f"recording: the folder has neither metadata.yaml nor *.mcap nor *.bag: {path}"
         )
     return FolderRecording(path)
+
+
+def _parts(bags: Sequence[Path], folder: Path) -> Sequence[Path]:
+    """Return bags by the number of their part; raises InputError unless they are one split bag."""
+    matches = {bag: match for bag in bags if (match := _PART.fullmatch(bag.stem))}
+    numbers = {int(match[2]): bag for bag, match in matches.items()}
+    is_split = (
+        len(numbers) == len(bags) == max(numbers) - min(numbers) + 1
+        and len({match[1] for match in matches.values()}) == 1
+    )
+    if len(bags) > 1 and not is_split:
+        names = ", ".join(bag.name for bag in bags)
+        raise InputError(
+            f"recording: not parts of one bag, give one of {names}"
+            f" (parts end in _0, _1 and so on): {folder}"
+        )
+    return [numbers[number] for number in sorted(numbers)] if is_split else bags
 
 
 def _packs_messages(metadata: Path) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
 
@@ -20,13 +21,34 @@ from sceneslam.sources.bag.recording import (
 from sceneslam.sources.bag.ros1_survey import BagSurvey
 from sceneslam.types.errors import InputError
 
+# The first message of a part comes after the last one of the part before, and sensors send
+# several per second; a busy computer loses seconds of them.
+_PAUSE_MAX_S = 10.0
+
 
 def open_bags(paths: Sequence[Path]) -> ChunkedRecording:
-    """Return one recording of all files; raises InputError unless all are ROS 1 bags."""
+    """Return one recording of all files, parts of one bag in their order.
+
+    Raises InputError unless all are ROS 1 bags, and each begins when the one before ends.
+    """
     bags = {path: BagFile(path) for path in paths}
     layouts = [bag.layout() for bag in bags.values()]
+    for before, after in pairwise(one for one in layouts if one.chunks):
+        _check_continued(before, after)
     is_slow = any(bag.is_slow for bag in bags.values())
     return ChunkedRecording(layouts, lambda chunk: bags[chunk.file].read(chunk), is_slow=is_slow)
+
+
+def _check_continued(before: Layout, after: Layout) -> None:
+    """Raise InputError if a bag does not begin when the one before ends, and none is damaged."""
+    end_ns = max(chunk.end_ns for chunk in before.chunks)
+    pause_s = (min(chunk.start_ns for chunk in after.chunks) - end_ns) * 1e-9
+    if abs(pause_s) > _PAUSE_MAX_S and not before.note and not after.note:
+        file, last = after.chunks[0].file, before.chunks[0].file
+        raise InputError(
+            f"recording: not parts of one bag, give one of them: {file.name} begins "
+            f"{pause_s:.1f} s after the end of {last.name}: {file.parent}"
+        )
 
 
 class BagFile:
