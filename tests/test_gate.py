@@ -182,12 +182,20 @@ def test_a_past_corrected_at_the_end_of_a_loss_is_no_motion():
     assert all(trusted(judged(module, revised_at=70))[70:])
 
 
-def witnessed(module, *, odometry=arc, steps=100, deviation_m=0.005, witness=lambda step: NOBODY):
+def witnessed(
+    module,
+    *,
+    odometry=arc,
+    steps=100,
+    deviation_m=0.005,
+    witness=lambda step: NOBODY,
+    period_s=PERIOD_S,
+):
     """Return the judgements of a module that states how certain it is."""
     gate = Gate(GATE, Wheels())
     return [
         gate.update(
-            round(step * PERIOD_S * 1e9),
+            round(step * period_s * 1e9),
             T_local_base=module(step),
             T_odom_base=odometry(step),
             deviation_m=deviation_m,
@@ -329,7 +337,7 @@ def test_a_ramp_refutes_no_module():
     assert not any(judgement.is_wrong for judgement in judgements)
 
 
-@pytest.mark.parametrize("steps", [4, 7, 11])
+@pytest.mark.parametrize("steps", [4, 7, 11, 25])
 def test_who_stood_still_over_a_loss_is_wrong(steps):
     """A module that goes on from its last pose before the loss, or wheels that stuck in it."""
     stuck = frozen(100, 100 + steps)
@@ -338,3 +346,24 @@ def test_who_stood_still_over_a_loss_is_wrong(steps):
     assert all(one.is_wrong and not one.wheels_lie for one in module)
     wheels = witnessed(lost_between(arc, 101, 100 + steps), odometry=stuck, steps=130)[after]
     assert all(one.wheels_lie and not one.is_wrong for one in wheels)
+
+
+@pytest.mark.parametrize("rate_hz", [10, 30])
+@pytest.mark.parametrize("gap_s", [0.5, 0.8, 1.0, 1.5, 3.0])
+def test_a_gentle_start_during_a_loss_is_no_jump(gap_s, rate_hz):
+    """The wheels are stuck; within the time of two velocities it shows that they are wrong."""
+
+    def starting(step):
+        driven_s = max(step / rate_hz - 5.0, 0.0)
+        return se3.from_xy_yaw(
+            0.15 * min(driven_s, 1.0) ** 2 + 0.3 * max(driven_s - 1.0, 0.0), 0, 0
+        )
+
+    end = round((5.0 + gap_s) * rate_hz)
+    judgements = witnessed(
+        lost_between(starting, 5 * rate_hz, end),
+        odometry=lambda _: EYE,
+        steps=end + 3 * rate_hz,
+        period_s=1.0 / rate_hz,
+    )
+    assert all(one.wheels_lie for one in judgements[end + round(0.6 * rate_hz) :])

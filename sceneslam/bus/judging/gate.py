@@ -67,8 +67,9 @@ _PROBATION_NS = 1_000_000_000  # a module is trusted after agreeing over a whole
 _DISTANCE_M, _TURN_RAD = 0.03, 0.0175
 _BROKEN_RATIO = 0.5  # of the distance; no wrong scale explains more: the turn is wrong, too
 # A robot accelerates by up to 1.5 m/s^2; a point 1 m ahead also by the angular acceleration.
-_STEP_S = 0.3  # interval for velocities and their changes
-_LATE_NS = 1_900_000_000  # a disagreement shows within the shortest horizon after it began
+_STEP_NS = 300_000_000  # interval for velocities and their changes
+_STEP_S = _STEP_NS / 1e9
+_LATE_NS = 1_300_000_000  # a disagreement shows within the shortest horizon after it began
 _JUMP_M_S = 0.2  # less is noise of the best modules
 _JUMP_SIGMAS = 3.0  # of a module's own noise; every observation is judged
 _JUMP_RATIO = 1.5  # times the other's change of velocity, to be the one that jumped
@@ -102,6 +103,14 @@ class _Excess:
     turn: float
     apart_m: float  # of points 1 m ahead of base, which move in a turn as well
     is_refuted: bool  # the yaw is too much, though the wheels alone turned as the gyro did
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Jump:
+    """A change of velocity; one in a gap is known when the velocity after it is."""
+
+    known_m_s: float
+    possible_m_s: float  # until then
 
 
 class Gate:
@@ -244,43 +253,55 @@ class Gate:
         The one at fault changes its velocity abruptly, as no robot can, and the other does not. If
         neither did, a module that is more certain than the wheels is right: wheel errors persist.
         A change of velocity counts if it explains a part of the disagreement of `apart_m` metres.
-        While the module is less certain, what was found last of this disagreement stands; whether
-        the wheels jumped is noted meanwhile.
+        While the module is less certain, or its change of velocity in a gap is not known, what was
+        found last of this disagreement stands; whether the wheels jumped is noted meanwhile.
         """
         wheels_m = _DISTANCE_M + self._wheels.drift_ratio * (now.way_m - then.way_m)
-        by_module, by_wheels = self._jumps(now)
+        module, wheels = self._jumps(now)
         least_m_s = max(_JUMP_M_S, _EXPLAINED * apart_m / _STEP_S)
-        self._have_wheels_jumped |= by_wheels > max(least_m_s, _JUMP_RATIO * by_module)
+        least_wheels_m_s = max(least_m_s, _JUMP_RATIO * module.possible_m_s)
+        self._have_wheels_jumped |= wheels.known_m_s > least_wheels_m_s
         if deviation_m is not None and deviation_m <= wheels_m and not self._module_erred:
             # A change of velocity is made of three positions, weighted 1, -2, 1.
             noise_m_s = math.sqrt(6.0) * deviation_m / _STEP_S
-            least_m_s = max(least_m_s, _JUMP_SIGMAS * noise_m_s)
-            self._module_erred = by_module > max(least_m_s, _JUMP_RATIO * by_wheels)
-            self._wheels_erred = not self._module_erred
+            least_m_s = max(least_m_s, _JUMP_SIGMAS * noise_m_s, _JUMP_RATIO * wheels.possible_m_s)
+            self._module_erred = module.known_m_s > least_m_s
+            if self._module_erred or module.possible_m_s <= least_m_s:
+                self._wheels_erred = not self._module_erred
         return self._wheels_erred
 
-    def _jumps(self, now: _Sample) -> tuple[float, float]:
-        """Return the largest recent changes of velocity [m/s]: the module's, the wheels'."""
-        newest_ns = self._samples[-1].stamp_ns if self._samples else now.stamp_ns  # before a gap
-        late = [*self._samples[self._until(newest_ns - _LATE_NS) :], now]
+    def _jumps(self, now: _Sample) -> tuple[_Jump, _Jump]:
+        """Return the largest recent changes of velocity: the module's, the wheels'."""
+        until_ns = now.stamp_ns
+        for _ in range(2):  # two velocities back, and so before a gap that has just ended
+            until_ns = self._samples[max(self._until(until_ns - _STEP_NS) - 1, 0)].stamp_ns
+        late = [*self._samples[self._until(until_ns - _LATE_NS) :], now]
         times_s = np.array([(sample.stamp_ns - now.stamp_ns) / 1e9 for sample in late])
         before = np.searchsorted(times_s, times_s - _STEP_S, side="right") - 1
         earlier = before.copy()  # whose velocity it is compared with
         if late[0] is self._first:  # since then there are shorter intervals only
             before[1:] = np.maximum(before[1:], 0)
             earlier = np.where(before > 0, before, np.arange(len(late)) - 1)
-        is_known = before >= 0
-        elapsed_s = np.where(is_known, times_s - times_s[before], np.nan)
+        later = np.searchsorted(before, np.arange(len(late)))  # whose velocity begins there
+        is_followed = later < len(late)
+        later = np.where(is_followed, later, -1)
+        elapsed_s = np.where(before >= 0, times_s - times_s[before], np.nan)
         # Over a short interval, an error of position makes a larger one of velocity.
         share = np.minimum(np.minimum(elapsed_s, 2.0 * elapsed_s[earlier]), _STEP_S) / _STEP_S
-        # Across a gap, a change has acted for longer and explains more.
-        share *= np.maximum(elapsed_s - np.median(np.diff(times_s)), _STEP_S) / _STEP_S
+        # Across a gap, a change has acted for longer and explains more. A robot may start or stop
+        # meanwhile: what counts is the detour from the velocity before to the one after.
+        longer = np.maximum(elapsed_s - np.median(np.diff(times_s)), _STEP_S) / _STEP_S
         found = []
         for poses in ([one.T_local_base for one in late], [one.T_odom_base for one in late]):
             points = np.array([T[:3, 3] + T[:3, 0] for T in poses])
             velocities = (points - points[before]) / elapsed_s[:, None]
-            changes = share * np.linalg.norm(velocities - velocities[earlier], axis=1)
-            found.append(float(changes[np.isfinite(changes)].max(initial=0.0)))
+            change = np.linalg.norm(velocities - velocities[earlier], axis=1)
+            back = np.linalg.norm(velocities[later] - velocities, axis=1)
+            across = np.linalg.norm(velocities[later] - velocities[earlier], axis=1)
+            detour = np.where(is_followed, (change + back - across) / 2.0, 0.0)
+            known = share * np.maximum(change, longer * detour)
+            possible = np.where(is_followed, known, share * longer * change)
+            found.append(_Jump(known_m_s=_largest(known), possible_m_s=_largest(possible)))
         return found[0], found[1]
 
     def _usual(self, now: _Sample, excess: float) -> float:
@@ -335,6 +356,10 @@ def _excess(then: _Sample, now: _Sample, sigmas: float, wheels: Wheels) -> _Exce
         apart_m=apart_m + apart_rad,
         is_refuted=missed_rad <= bound_rad < abs(se3.yaw_rad(R_local_odom.T @ now.R_local_odom)),
     )
+
+
+def _largest(values: NDArray[np.float64]) -> float:
+    return float(values[np.isfinite(values)].max(initial=0.0))
 
 
 def _norm(vector: NDArray[np.float64]) -> float:
