@@ -12,6 +12,7 @@ from test_bus_gate import ONE, errors_m
 from sceneslam.types import se3
 from sceneslam.types.observation import TrackingStatus
 from sceneslam.types.run import BRIDGED
+from sceneslam.types.trajectory import Trajectory
 
 OPTIONS = {"steps": 120, "table": ONE, "gate": GATE, "handover": "rewind"}
 
@@ -104,6 +105,31 @@ def test_a_correction_of_its_past_meanwhile_is_no_motion():
     feed = frozen(40, without=[52, 53])
     _, atlas, _, _ = drive({"bright": Revised()}, feed=feed, **OPTIONS)
     np.testing.assert_allclose(errors_m(atlas.trajectory)[51:], 0.5, atol=1e-6)
+
+
+@pytest.mark.parametrize(("loop_at", "data_at"), [(36, 37), (39, 37), (39, 40)])
+def test_poses_are_interpolated_in_the_map_of_the_next_answer(loop_at, data_at):
+    """It has no data from where the suspicion begins until it closes a loop, or before that."""
+    said = []
+
+    class Closing(Uncertain):
+        """Drifts by 10 cm until 30; closes a loop, and reports the whole path at its end."""
+
+        def track(self, observation):
+            tracking, index = super().track(observation), observation.stamp_ns // PERIOD_NS
+            said.append((observation.stamp_ns, tracking.T_local_base))
+            aside = se3.from_xy_yaw(0.0, min(index, 30) / 300 if index < loop_at else 0.0, 0.0)
+            T_local_base = aside @ tracking.T_local_base
+            return replace(tracking, T_local_base=T_local_base, revision=int(index >= loop_at))
+
+        def get_trajectory(self):
+            stamps_ns, poses = zip(*said, strict=True)
+            return Trajectory(stamps_ns=np.array(stamps_ns), T_world_base=np.stack(poses))
+
+    feed = frozen(40, without=range(34, data_at))
+    _, atlas, log, _ = drive({"bright": Closing(60)}, feed=feed, **OPTIONS)
+    assert events(log, "revised")[-1]["from_ns"] == 34 * PERIOD_NS
+    assert errors_m(atlas.trajectory).max() < 1e-9 and len(atlas.sessions) == 1
 
 
 def test_a_second_disagreement_before_the_first_was_decided_belongs_to_it():

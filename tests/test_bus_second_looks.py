@@ -259,6 +259,24 @@ def test_what_a_hand_over_reports_is_corrected_once(monkeypatch):
     assert_exact(atlas)
 
 
+@pytest.mark.parametrize("jumps_at", [150, 152, 155, 158])
+def test_a_loop_closed_just_before_a_suspicion_is_applied_once(jumps_at):
+    """The module is 1 m off for 1.5 s; its poses are bridged from before the loop."""
+
+    class Jumping(Closing):
+        def track(self, observation):
+            told, index = super().track(observation), observation.stamp_ns // PERIOD_NS
+            aside = se3.from_xy_yaw(0.0, float(jumps_at <= index < jumps_at + 15), 0.0)
+            T_local_base = aside @ told.T_local_base
+            return replace(told, T_local_base=T_local_base, covariance=1e-6 * np.eye(6))
+
+    modules = {"bright": Jumping(tells=True)}
+    options = {"handover": "rewind", "gate": GATE, "table": ALONE, "lost_patience_s": 1.0}
+    _, atlas, log, _ = drive(modules, steps=240, **options)
+    assert len(events(log, "suspect")) == 1 and len(atlas.sessions) == 2
+    assert_exact(atlas)
+
+
 def test_what_a_module_revises_of_replaced_poses_moves_no_other():
     """From where it becomes dark, the module errs by 25 cm/s; at the end it repairs that."""
 

@@ -211,7 +211,7 @@ def told_atlas(journal, seed):
             transforms = (se3.exp(draw.normal(size=6)) for _ in range(2))
             session = atlas.begin_session(f"möd_{kind}", *transforms)
         if kind == 1:
-            atlas.rewind(stamp_ns - 50)
+            atlas.rewind(stamp_ns - 50, se3.exp(draw.normal(size=6)) if draw.integers(2) else None)
         if kind == 2:
             revised = atlas.online
             known = np.tile(draw.uniform() * np.eye(6), (len(revised), 1, 1))
@@ -221,7 +221,9 @@ def told_atlas(journal, seed):
         known = draw.normal(size=(6, 6))
         covariance = known @ known.T if kind > 5 else None
         atlas.add_local(stamp_ns, se3.exp(draw.normal(size=6)))
-        atlas.add(stamp_ns, se3.exp(draw.normal(size=6)), "" if kind == 3 else "möd", covariance)
+        atlas.add(
+            stamp_ns, se3.exp(draw.normal(size=6)), "" if kind in (1, 3) else "möd", covariance
+        )
         if kind == 4:
             nodes_ns = np.unique(draw.integers(0, stamp_ns, size=5))
             moved = np.array([se3.exp(draw.normal(size=6)) for _ in nodes_ns])

@@ -80,6 +80,50 @@ def test_a_session_starts_where_the_last_pose_ended_that_it_did_not_replace(twis
     np.testing.assert_allclose(atlas.sessions[1].T_map_local, T_map_local @ true[3], atol=1e-9)
 
 
+@given(twist=twists, error=twists, placed=twists)
+def test_what_is_bridged_from_a_corrected_pose_is_corrected_once(twist, error, placed):
+    """The module corrects its past twice, and its poses are replaced from 2, then from 3 on."""
+    atlas = Atlas(voxel_m=0.05)
+    true, T_map_local = drive(8, 0.1 * twist), se3.exp(placed)
+    told = np.stack([T @ se3.exp(0.1 * i * error) for i, T in enumerate(true)])
+    first = add_session(atlas, "a", T_map_local, range(4), told[:4])
+    T_map_bridged, T_new_told = T_map_local @ told[1] @ se3.inverse(true[1]), se3.exp(0.1 * error)
+    for begin, end in ((2, 4), (3, 5)):
+        T_map_bridged = T_new_told @ T_map_bridged
+        atlas.rewind(begin, T_new_told)
+        for stamp_ns in range(begin, end):
+            atlas.add(stamp_ns, T_map_bridged @ true[stamp_ns], BRIDGED)
+    later = [se3.inverse(true[5]) @ T for T in true[5:]]
+    second = add_session(atlas, "a", T_map_bridged @ true[5], range(5, 8), later)
+    revised = Trajectory(stamps_ns=np.arange(4), T_world_base=true[:4])
+    atlas.close_session(first, MapLayers(), revised)
+    atlas.close_session(second, MapLayers(), Trajectory.empty())
+    np.testing.assert_allclose(atlas.trajectory.T_world_base, T_map_local @ true, atol=1e-9)
+    np.testing.assert_allclose(atlas.sessions[1].T_map_local, T_map_local @ true[5], atol=1e-9)
+
+
+@given(twist=twists, error=twists, placed=twists)
+def test_what_is_bridged_from_where_a_session_starts_is_corrected_once(twist, error, placed):
+    """All poses of the second session are replaced, and it is placed anew."""
+    atlas = Atlas(voxel_m=0.05)
+    true, T_map_local, T_new_told = drive(8, 0.1 * twist), se3.exp(placed), se3.exp(0.1 * error)
+    told = np.stack([T @ se3.exp(0.1 * i * error) for i, T in enumerate(true)])
+    first = add_session(atlas, "a", T_map_local, range(3), told[:3])
+    T_map_bridged = T_new_told @ T_map_local @ told[2] @ se3.inverse(true[2])
+    atlas.begin_session("b", T_map_bridged @ true[3], T_new_told)
+    atlas.add(3, T_map_bridged @ true[3] @ se3.exp(error), "b")
+    atlas.rewind(3, T_new_told)
+    atlas.add(3, T_map_bridged @ true[3], BRIDGED)
+    later = [se3.inverse(true[4]) @ T for T in true[4:]]
+    add_session(atlas, "b", T_map_bridged @ true[4], range(4, 8), later)
+    revised = Trajectory(stamps_ns=np.arange(3), T_world_base=true[:3])
+    atlas.close_session(first, MapLayers(), revised)
+    np.testing.assert_allclose(atlas.trajectory.T_world_base, T_map_local @ true, atol=1e-9)
+    for session, start in ((1, 3), (2, 4)):
+        T_map_start = atlas.sessions[session].T_map_local
+        np.testing.assert_allclose(T_map_start, T_map_local @ true[start], atol=1e-9)
+
+
 def test_a_bridged_pose_moves_with_the_revised_pose_before_it():
     atlas = Atlas(voxel_m=0.05)
     session = add_session(atlas, "a", se3.identity(), [0, 1], [se3.identity()] * 2)

@@ -66,6 +66,8 @@ class PosePath:
     sessions: array[int] = field(
         default_factory=lambda: array("q")
     )  # its session, -1 before the first; bridged: the one before, until the new one answers
+    # T_new_told of the pose before a row, where this row and those after it replaced others.
+    moved: dict[int, Transform] = field(default_factory=dict)
     # Upper triangles as reported, of the poses in the modules' maps, and of these; NaN: none.
     _covariances: Rows = field(default_factory=lambda: Rows(len(_NONE)))
     _maps: Rows = field(default_factory=lambda: Rows(len(_NONE)))
@@ -102,13 +104,16 @@ class PosePath:
         self.begun.append(begun)
         self.sessions.append(session)
 
-    def cut(self, stamp_ns: int) -> None:
-        """Remove the poses from an instant on."""
+    def cut(self, stamp_ns: int, T_new_told: Transform | None = None) -> None:
+        """Remove the poses from an instant on; T_new_told (4, 4): of the last one left."""
         keep = bisect_left(self.stamps_ns, stamp_ns)
         for values in (self.stamps_ns, self.modules, self.begun, self.sessions):
             del values[keep:]
         for rows in (self.poses, self._covariances, self._maps):
             rows.cut(keep)
+        self.moved = {row: one for row, one in self.moved.items() if row < keep}
+        if T_new_told is not None:
+            self.moved[keep] = T_new_told
 
     def covariance_at(self, row: int) -> Covariance | None:
         """Return the covariance (6, 6) that was reported with a pose, None without one."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,16 +29,19 @@ def revise(
     T_map_base: NDArray[np.float64],
     pose_sessions: NDArray[np.int64],
     is_bridged: NDArray[np.bool_],
+    replaced: Mapping[int, Transform],
 ) -> Revised:
     """Return the poses after all revisions.
 
     `pose_sessions` (N,): the newest session when a pose was added, -1 before the first.
+    `replaced`: by the first row of poses that replaced others: T_new_told (4, 4), how its module
+    had corrected the pose before it since that was added.
 
     Every pose is corrected as the last revised pose of its session before it, so that bridged
-    motions do not change. A session starts where the revised session before it ended (Eq. 1), less
-    the correction that was known at the hand-over.
+    motions do not change. A session starts where the revised session before it ended (Eq. 1).
+    Both are less the correction that was known when the poses were added.
     """
-    moved = np.array(T_map_base)
+    moved, answers = np.array(T_map_base), np.cumsum(~is_bridged)
     placed: list[Transform] = []
     carried, is_revised = se3.identity(), False  # correction of `map` at the last session's end
     for index, session in enumerate(sessions):
@@ -46,6 +49,11 @@ def revise(
         begun = carried @ se3.inverse(session.T_new_told) if is_revised else carried
         T_map_local, corrections = _corrections(session, begun, stamps_ns[rows], is_bridged[rows])
         placed.append(T_map_local)
+        for row in (row for row in replaced if row in rows[rows > 0]):
+            if row > rows[0]:  # else it follows a pose of the session before
+                carried, is_revised = corrections[row - rows[0] - 1], len(session.revised) > 0
+            bridged = carried @ se3.inverse(replaced[row]) if is_revised else carried
+            corrections[(rows >= row) & (answers[rows] == answers[row - 1])] = bridged
         moved[rows] = corrections @ moved[rows]
         if len(rows):
             carried, is_revised = corrections[-1], len(session.revised) > 0
@@ -61,7 +69,7 @@ def _corrections(
     """Return the revised T_map_local (4, 4), and T_revised_told (N, 4, 4) of poses in `map`."""
     online, revised, T_map_local = session.online, session.revised, carried @ session.T_map_local
     if not len(revised):
-        return T_map_local, np.broadcast_to(carried, (len(stamps_ns), 4, 4))
+        return T_map_local, np.tile(carried, (len(stamps_ns), 1, 1))
     _, told_rows, revised_rows = np.intersect1d(
         online.stamps_ns, revised.stamps_ns, assume_unique=True, return_indices=True
     )

@@ -131,7 +131,7 @@ class Estimator:
         untrusted, before = self._memory.after(since_ns), self._memory.last_until(since_ns)
         if before is None or not untrusted:
             return moment
-        return self._retell(bridged(before, [*untrusted, moment]))
+        return self._retell(bridged(before, [*untrusted, moment]), before.T_new_told)
 
     def _acquit(self, suspicion: Suspicion, moment: BufferedObservation) -> BufferedObservation:
         """Take the remembered poses of a suspicion from the module after all.
@@ -141,9 +141,14 @@ class Estimator:
         since_ns = max(suspicion.since_ns, self._memory.oldest_ns)
         before, runner = self._memory.last_until(since_ns), self.active
         assert before is not None and runner is not None and runner.T_map_local is not None
+        moments = [*self._memory.after(since_ns), moment]
+        first = next(each.tracking for each in moments if each.tracking is not None)
+        if before.tracking is not None and before.tracking.revision == first.revision:
+            before = replace(before)
+            before.move(se3.inverse(before.T_new_told))  # as told; so are the next answers
         bridge, told = before.bridge.copy(), list[BufferedObservation]()
         missed, last = list[BufferedObservation](), before
-        for each in [*self._memory.after(since_ns), moment]:
+        for each in moments:
             answer = each.tracking
             if answer is None:
                 missed.append(each)
@@ -164,11 +169,16 @@ class Estimator:
                 self._back_end.add_local(each.stamp_ns, answer.T_local_base)
             told.append(last)
             missed = []
-        return self._retell(told)
+        return self._retell(told, before.T_new_told)
 
-    def _retell(self, moments: list[BufferedObservation]) -> BufferedObservation:
-        """Replace the last poses, the newest of which was not told yet; return that."""
-        self._back_end.rewind(moments[0].stamp_ns)
+    def _retell(
+        self, moments: list[BufferedObservation], T_new_told: Transform
+    ) -> BufferedObservation:
+        """Replace the last poses, the newest of which was not told yet; return that.
+
+        `T_new_told` (4, 4) is the correction of the pose before them.
+        """
+        self._back_end.rewind(moments[0].stamp_ns, T_new_told)
         self._put(moments[:-1], moments[-1].stamp_ns)
         self.session.bridge = moments[-1].bridge.copy()
         return moments[-1]

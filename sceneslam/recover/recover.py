@@ -113,8 +113,8 @@ class _Retold:
     ) -> None:
         self._atlas.add(stamp_ns, T_map_base, module, covariance, map_covariance)
 
-    def add_rewind(self, stamp_ns: int) -> None:
-        self._atlas.rewind(stamp_ns)
+    def add_rewind(self, stamp_ns: int, T_new_told: Transform | None) -> None:
+        self._atlas.rewind(stamp_ns, T_new_told)
 
     def add_correction(self, stamps_ns: NDArray[np.int64], T_new_old: NDArray[np.float64]) -> None:
         self._atlas.correct(Correction(stamps_ns=stamps_ns, T_new_old=T_new_old))

@@ -10,7 +10,7 @@
 | `S` | T_map_local and T_new_told of a new session, key of its module |
 | `L` | stamp, T_local_base of the session |
 | `P` | stamp, T_map_base, two covariances (each a byte 1 and 21 numbers, or a byte 0), its module |
-| `R` | stamp from which on poses are taken back |
+| `R` | stamp from which on poses are taken back; T_new_told of the last one left, if it is known |
 | `M` | stamps and T_new_old at which the atlas corrects the poses otherwise than before |
 | `F` | the same of the end: all of it, of the poses as their modules revised them |
 | `C` | number of a session, a byte 1 (0: no covariances); revised stamps, poses and covariances |
@@ -41,7 +41,7 @@ from sceneslam.types.se3 import Transform
 from sceneslam.types.trajectory import Trajectory
 
 JOURNAL = "journal.bin"
-MAGIC = b"SceneSLAM journal 5\n"
+MAGIC = b"SceneSLAM journal 6\n"
 _HEAD = struct.Struct("<cII")
 _STAMP = struct.Struct("<q")
 _POSE_BYTES = 12 * 8
@@ -102,9 +102,9 @@ class Journal:
             body += b"\0" if known is None else b"\1" + triangle(known).tobytes()
         self._add(b"P", body + module.encode())
 
-    def add_rewind(self, stamp_ns: int) -> None:
+    def add_rewind(self, stamp_ns: int, T_new_told: Transform | None) -> None:
         """Record that the poses from a stamp on are removed."""
-        self._add(b"R", _STAMP.pack(stamp_ns))
+        self._add(b"R", _STAMP.pack(stamp_ns) + (b"" if T_new_told is None else _pose(T_new_told)))
 
     def add_correction(self, stamps_ns: NDArray[np.int64], T_new_old: NDArray[np.float64]) -> None:
         """Record the correction of poses, T_new_old (N, 4, 4) [m], at stamps (N,)."""
@@ -218,7 +218,8 @@ def _covariance(body: bytes) -> tuple[NDArray[np.float64] | None, bytes]:
 
 
 def _tell_rewind(log: TrajectoryLog, body: bytes) -> None:
-    log.add_rewind(_number(body))
+    T_new_told = body[_STAMP.size :]
+    log.add_rewind(_number(body), _transform(T_new_told) if T_new_told else None)
 
 
 def _tell_correction(log: TrajectoryLog, body: bytes) -> None:
