@@ -230,6 +230,14 @@ def test_points_of_an_optical_frame_without_transforms_look_ahead(
     np.testing.assert_array_equal(source.rig.lidar.T_base_lidar, T_base_lidar)
 
 
+def test_a_scan_without_transforms_is_level_in_an_optical_frame_as_well(tmp_path: Path) -> None:
+    """`depthimage_to_laserscan` may have been given the frame of its images."""
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        recorder.scan("/scan", STAMP_NS, [1.0] * 21, frame="camera_depth_optical_frame")
+    source = make_source("mcap", tmp_path / "a.mcap")
+    np.testing.assert_array_equal(source.rig.laser.T_base_laser, np.eye(4))
+
+
 @pytest.mark.parametrize(
     ("frame", "T_base_cam", "is_odd"),
     [

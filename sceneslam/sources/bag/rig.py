@@ -64,7 +64,7 @@ def make_rig(recording: Recording, topics: BagTopics, frames: FrameTree, given: 
     said = recording.metadata.get(names.RIG_METADATA, {})
     laser = lidar = None
     if topics.scan:
-        laser = Laser(T_base_laser=place(recording, topics.scan, frames))
+        laser = Laser(T_base_laser=place(recording, topics.scan, frames, is_planar=True))
     if topics.points:
         lidar = Lidar(
             range_m=given.lidar_range_m or _said(said, "lidar_range_m") or _LIDAR_RANGE_M,
@@ -81,11 +81,18 @@ def make_rig(recording: Recording, topics: BagTopics, frames: FrameTree, given: 
     return Rig(sensors=sensors, camera=camera, laser=laser, lidar=lidar, wheels=given.wheels)
 
 
-def place(recording: Recording, topic: str, frames: FrameTree) -> Transform:
-    """Return T_base_sensor (4, 4) [m] of a topic's sensor; if it is not recorded, the usual one."""
+def place(
+    recording: Recording, topic: str, frames: FrameTree, *, is_planar: bool = False
+) -> Transform:
+    """Return T_base_sensor (4, 4) [m] of a topic's sensor; if it is not recorded, the usual one.
+
+    A planar one is level even in an optical frame: that of the depth images it is computed from.
+    """
     message = first(recording, topic)
     T_base_sensor = None if message is None else frames.T_base(decode.frame_id(message))
-    return _usual(message) if T_base_sensor is None else T_base_sensor
+    if T_base_sensor is not None:
+        return T_base_sensor
+    return se3.identity() if is_planar else _usual(message)
 
 
 def unplaced(recording: Recording, topics: BagTopics, frames: FrameTree) -> list[str]:
