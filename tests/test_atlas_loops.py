@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from planar_poses import transforms
-from test_atlas_maps import edge
+from test_atlas_maps import Found, carried, edge
 from test_atlas_places import CELL, plan_of, quality
 
 from sceneslam.atlas.lasting.saved_map import empty_map
@@ -14,11 +14,13 @@ from sceneslam.atlas.places.floor_plan import join
 from sceneslam.atlas.submaps import plan_loops
 from sceneslam.atlas.submaps.chain import Chain
 from sceneslam.atlas.submaps.loop_query import LoopQuery
+from sceneslam.atlas.submaps.piece_loops import PieceLoops
 from sceneslam.atlas.submaps.plan_loops import PlanLoops
 from sceneslam.atlas.submaps.run_graph import RunGraph
 from sceneslam.atlas.submaps.submap import Drawing, Submap
 from sceneslam.graphs.edge import EdgeKind
 from sceneslam.types import planar, se3
+from sceneslam.types.covariance import unknown_motion
 
 WALL = plan_of("##")
 EMPTY = join([])
@@ -205,10 +207,13 @@ def test_a_target_is_made_once_for_all_that_are_compared_with_it(monkeypatch):
         assert len(compared.targets) == made
 
 
-def query_along(nodes):
-    """The query for the last node of a run that measured the motions from node to node."""
+def query_along(nodes, starts=()):
+    """The query for the last node of a run that measured the motions but those to `starts`."""
     steps = [se3.inverse(a) @ b for a, b in pairwise(nodes)]
     motions = [replace(edge(k, k + 1), T_first_second=step) for k, step in enumerate(steps)]
+    for start in starts:
+        seam, unknown = motions[start - 1], unknown_motion(10.0)
+        motions[start - 1] = replace(seam, kind=EdgeKind.HANDOVER, covariance=unknown)
     chain = Chain(
         submaps=[submap(0)] * len(nodes),
         T_run_node=nodes,
@@ -267,3 +272,20 @@ def test_a_loop_by_plans_closes_the_climb_of_a_base_that_is_mounted_askew(pitch_
     off = se3.log(se3.inverse(due) @ found)
     assert np.abs(off[2]) < 2e-6  # the odometry is off by 0.08 and 0.2 m
     assert np.abs(off[3:5]).max() < 1e-9
+
+
+@pytest.mark.parametrize("tilt_rad", [0.0, 0.15])
+def test_a_loop_to_a_piece_has_the_tilt_of_a_sensor_that_is_carried_by_hand(monkeypatch, tilt_rad):
+    count = 24
+    flat = transforms([[2.0 * np.cos(k), 2.0 * np.sin(k), k] for k in np.arange(count) / 2])
+    held = carried(flat, tilt_rad, np.random.default_rng(0))
+    nodes = se3.inverse(held[0]) @ held  # the map begins with the first pose
+    query = query_along(list(nodes), starts=[count // 2])
+    ups = [replace(one, up=T[2, :3]) for one, T in zip(query.submaps, held, strict=True)]
+    query = replace(query, submaps=ups)
+    Found(monkeypatch, [quality(at=query.plane[-1])])
+    (loop,) = PieceLoops().loops_to(query, nodes)
+    assert loop.first < count // 2 and loop.second == count - 1
+    off = se3.log(se3.inverse(nodes[-1]) @ nodes[loop.first] @ loop.T_first_second)
+    assert np.abs(off[3:5]).max() < 0.003
+    assert (np.sqrt(loop.covariance[2, 2]) > 0.5) == (tilt_rad > 0.0)

@@ -317,6 +317,41 @@ def test_a_piece_is_joined_where_two_of_its_submaps_agree(monkeypatch):
     assert around == [[0, 1], [-1, 0, 1], [-1, 0]]
 
 
+def carried(T_map_node, tilt_rad, rng):
+    """The nodes (N, 4, 4) as a hand carries base: tilted by up to this, and at any height."""
+    off = tilt_rad * rng.uniform(-1.0, 1.0, (len(T_map_node), 6)) * [0.0, 0.0, 1.0, 1.0, 1.0, 0.0]
+    return np.array([T @ se3.exp(each) for T, each in zip(T_map_node, off, strict=True)])
+
+
+@pytest.mark.parametrize("is_held", [(True, True), (True, False), (False, True), (False, False)])
+def test_a_piece_that_was_carried_by_hand_keeps_its_tilt_where_it_is_joined(monkeypatch, is_held):
+    """A round each, of base that was held or moved on a floor; both frames begin with a pose."""
+    rng, count = np.random.default_rng(0), 10
+    rounds = []
+    for held in is_held:
+        flat = transforms([[4.0 * np.sin(k), -4.0 * np.cos(k), k] for k in np.arange(count)])
+        rounds.append(carried(flat, 0.15 * held, rng))
+    nodes = np.concatenate([se3.inverse(each[0]) @ each for each in rounds])
+    steps = [(k, k + 1) for k in range(2 * count - 1) if k != count - 1]
+    motions = [
+        replace(edge(a, b), T_first_second=se3.inverse(nodes[a]) @ nodes[b]) for a, b in steps
+    ]
+    saved = map_of(*[WALL] * 2 * count, pieces=np.repeat([0, 1], count), edges=motions)
+    ups = np.concatenate(rounds)[:, 2, :3]
+    submaps = tuple(replace(one, up=up) for one, up in zip(saved.submaps, ups, strict=True))
+    due = np.linalg.inv(rounds[0][0]) @ np.concatenate(rounds)
+    lies = planar.from_transforms(due[count:])
+    Found(monkeypatch, [quality(at=at) for at in lies])
+    joined = join_pieces(replace(saved, submaps=submaps, T_map_node=nodes))
+    loops = [loop for loop in joined.edges if loop.is_loop]
+    assert joined.apart == 0 and len(loops) >= 9
+    tilts_rad = [
+        se3.log(se3.inverse(due[one.second]) @ due[one.first] @ one.T_first_second)[3:5]
+        for one in loops
+    ]
+    assert np.abs(tilts_rad).max() < 0.004
+
+
 @pytest.mark.parametrize(
     ("loops", "middle_m"), [([], 3.8), ([edge(0, 1, (3.5, 0.0, 0.0), kind=EdgeKind.LOOP)], 3.5)]
 )

@@ -13,7 +13,7 @@ from sceneslam.atlas.places.floor_plan import join
 from sceneslam.atlas.places.recognition import Recognizer
 from sceneslam.atlas.submaps.graph import Solved, consistent, on_floor, solve
 from sceneslam.atlas.submaps.path_drift import PathDrift
-from sceneslam.atlas.submaps.uprights import uprights
+from sceneslam.atlas.submaps.uprights import by_hand, floor_normal, tilt, uprights
 from sceneslam.graphs.edge import Edge
 from sceneslam.types import planar, se3
 from sceneslam.views.landmark_registration import recognize
@@ -78,15 +78,26 @@ def _loops_by_walls(saved: SavedMap, piece: int, own: Sequence[int]) -> list[Edg
     plane, target = saved.plane, Recognizer.of(saved.plan(piece))
     if target is None:
         return []
+    part = saved.of(own)
+    is_held = any(
+        floor_normal(each.edges, each.T_map_node, each.submaps) is None
+        for each in (part, saved.of(saved.nodes(piece)))
+    )
     found = []
     for row, node in enumerate(own):
         around = own[max(row - _AROUND, 0) : row + _AROUND + 1]
         near = [index for index in around if saved.submaps[index].run == saved.submaps[node].run]
         query = join([(planar.between(plane[node], plane[i]), saved.submaps[i].plan) for i in near])
         match = target.locate(query)
-        if match is not None:
-            T_map_node = saved.standing(planar.to_transform(match.T_target_query), piece)
-            found.append(saved.loop_to(T_map_node, on_floor(match.covariance), node, piece=piece))
+        if match is None:
+            continue
+        T_map_node = saved.standing(planar.to_transform(match.T_target_query), piece)
+        covariance = on_floor(match.covariance)
+        if is_held:
+            T_level_node = tilt(part.T_map_node, part.submaps, row)
+            T_map_node = T_map_node @ T_level_node
+            covariance = by_hand(match.covariance, T_level_node)
+        found.append(saved.loop_to(T_map_node, covariance, node, piece=piece))
     return found
 
 

@@ -14,6 +14,7 @@ from sceneslam.atlas.submaps.graph import on_floor
 from sceneslam.atlas.submaps.path_drift import PathDrift
 from sceneslam.atlas.submaps.submap import Submap
 from sceneslam.atlas.submaps.uprights import by_hand, floor_normal, tilt
+from sceneslam.graphs.edge import Edge
 from sceneslam.motion.tilt import upright
 from sceneslam.types import planar, se3
 from sceneslam.types.planar import Matrix, Planar
@@ -40,6 +41,7 @@ class LoopQuery:
     submaps: Sequence[Submap]
     T_run_node: NDArray[np.float64]  # (N, 4, 4)
     plane: NDArray[np.float64]  # (N, 3), the nodes in the plane [m, m, rad]
+    motions: Sequence[Edge]  # from each submap to the next
     drift: PathDrift
     floor_normal: Vector | None  # (3,), in base; None: base is carried by hand
     starts: Sequence[int]  # with these a piece begins: the motion to them is hardly known
@@ -53,6 +55,7 @@ class LoopQuery:
             submaps=chain.submaps,
             T_run_node=nodes,
             plane=planar.from_transforms(chain.T_run_node),
+            motions=chain.motions,
             drift=PathDrift.of(chain.drift),
             floor_normal=floor_normal(chain.motions, nodes, chain.submaps),
             starts=chain.starts,
@@ -96,11 +99,18 @@ class LoopQuery:
         T_run_second = T_found_lies @ self.T_run_node[self.second]
         return np.asarray(se3.inverse(self.T_run_node[first]) @ T_run_second)
 
+    @property
+    def T_level_second(self) -> Transform:
+        """Return the submap's roll and pitch (4, 4) if base is carried by hand; none on a floor."""
+        if self.floor_normal is not None:
+            return se3.identity()
+        return tilt(self.T_run_node, self.submaps, self.second)
+
     def spatial(self, covariance: Matrix) -> NDArray[np.float64]:
         """Return the covariance (6, 6) of a motion to the submap from that in the plane (3, 3)."""
         if self.floor_normal is not None:
             return on_floor(covariance)
-        return by_hand(covariance, tilt(self.T_run_node[self.second]))
+        return by_hand(covariance, self.T_level_second)
 
     def window(self, first: int) -> SearchWindow:
         """Return where the submap may lie in the frame of an earlier one."""

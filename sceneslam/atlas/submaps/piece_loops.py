@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from sceneslam.atlas.lasting.saved_map import SavedMap
 from sceneslam.atlas.places.floor_plan import join
 from sceneslam.atlas.places.recognition import Recognizer
-from sceneslam.atlas.submaps.graph import on_floor
 from sceneslam.atlas.submaps.loop_query import LoopQuery
 from sceneslam.graphs.edge import Edge
 from sceneslam.types import planar
@@ -42,8 +41,9 @@ class _Piece:
             return None
         if match is None:
             return None
-        T_map_node = self.map.standing(planar.to_transform(match.T_target_query))
-        covariance = on_floor(match.covariance)
+        T_map_level = self.map.standing(planar.to_transform(match.T_target_query))
+        T_map_node = T_map_level @ query.T_level_second
+        covariance = query.spatial(match.covariance)
         return self.map.loop_to(T_map_node, covariance, query.second, first=self.first)
 
 
@@ -75,16 +75,17 @@ class PieceLoops:
 
 
 def _piece(ends: tuple[int, int], query: LoopQuery, T_map_node: NDArray[np.float64]) -> _Piece:
-    own = slice(*ends)
+    start, end = ends
+    own = slice(start, end)
     submaps = tuple(query.submaps[own])
     piece = SavedMap(
         submaps=submaps,
         T_map_node=T_map_node[own],
         pieces=np.zeros(len(submaps), np.int64),
-        edges=(),
+        edges=tuple(motion.shifted(-start) for motion in query.motions[start : end - 1]),
     )
     try:
         walls = Recognizer.of(piece.plan())
     except InputError:
         walls = None
-    return _Piece(first=ends[0], map=piece, walls=walls)
+    return _Piece(first=start, map=piece, walls=walls)

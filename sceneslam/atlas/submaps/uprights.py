@@ -97,26 +97,28 @@ def floor_normal(
 def turning_axis(T_map_node: NDArray[np.float64]) -> Vector:
     """Return the direction (3,) in nodes (N, 4, 4) that changes least in the map.
 
-    It is their own z if their headings hardly differ.
+    It is the map's own z, as it usually is in them, if their headings hardly differ.
     """
+    x, y, z = np.median(T_map_node[:, 2, :3], axis=0)
     mean = T_map_node[:, :3, :3].mean(axis=0)
     spread = np.eye(3) - mean.T @ mean  # u' spread u: variance of a direction u in the map
-    x_y = np.linalg.solve(spread[:2, :2] + _HEADINGS * np.eye(2), -spread[:2, 2])
-    axis = np.append(x_y, 1.0)
+    pulled = _HEADINGS * np.array([x, y]) / z - spread[:2, 2]
+    axis = np.append(np.linalg.solve(spread[:2, :2] + _HEADINGS * np.eye(2), pulled), 1.0)
     return np.asarray(axis / np.linalg.norm(axis))
 
 
-def tilt(T_map_node: Transform) -> Transform:
-    """Return T_level_node (4, 4): roll and pitch of a pose without its part in the plane."""
-    T_map_level = planar.to_transform(planar.from_transform(T_map_node))
-    T_level_node = se3.inverse(T_map_level) @ T_map_node
-    return se3.from_parts(T_level_node[:3, :3], np.zeros(3))
+def tilt(T_map_node: NDArray[np.float64], submaps: Sequence[Submap], node: int) -> Transform:
+    """Return the roll and pitch (4, 4) of a node against what is usually level in the map."""
+    T_level_map = upright(se3.identity(), usual_up(submaps, T_map_node, _UP))
+    T_level_node = T_level_map @ T_map_node[node]
+    T_level_flat = planar.to_transform(planar.from_transform(T_level_node))
+    return se3.from_parts((se3.inverse(T_level_flat) @ T_level_node)[:3, :3], np.zeros(3))
 
 
 def by_hand(covariance: Matrix, T_level_node: Transform) -> NDArray[np.float64]:
     """Return the covariance (6, 6) of a node carried by hand from that in the plane (3, 3).
 
-    Height and tilt are open. It is in the axes of the node.
+    Height and tilt are open. It is in the axes of the node, which has the `tilt` T_level_node.
     """
     level = planar.spatial_covariance(covariance, level=_HELD)
     return se3.carried(level, se3.inverse(T_level_node))
