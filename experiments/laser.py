@@ -105,6 +105,8 @@ class Run:
             atlas.add(tracking.stamp_ns, tracking.T_local_base, "laser", tracking.covariance)
             if has_loops:
                 atlas.observe(observation, None)
+            else:
+                atlas.report(tracking.stamp_ns)
             self.costs_ms.append((process_time() - before_s) * 1e3)
         atlas.close_session(session, module.get_map(), module.get_trajectory())
         faults = atlas.finish()
