@@ -148,10 +148,15 @@ def _said(error: Exception) -> str:
 
 
 def _without_paths(error: MissingConfigException, options: Sequence[str]) -> str:
-    """Return Hydra's message on an option that does not exist without the paths it looked in."""
+    """Return Hydra's message on an option that does not exist without the paths it looked in.
+
+    The file that asks for it is named, unless it is `config`, which Hydra says of the command line.
+    """
     group = re.findall(r"Available options in '(.+)':", str(error))[0]
     name = str(error.missing_cfg_file).removeprefix(f"{group}/")
-    return str(ConfigError(group, name, f"one of: {', '.join(options)}"))
+    asking = re.match(r"In '(?!config')(.+?)':", str(error))
+    said = str(ConfigError(group, name, f"one of {', '.join(options)}"))
+    return f"{said} (in {asking[1]}.yaml)" if asking else said
 
 
 def _without_advice(error: HydraException) -> str:

@@ -54,7 +54,7 @@ def test_run_says_what_happened_in_ten_lines_at_most(folder):
         ((*SINGLE, "policy.confirm_window_s=-1"), "policy.confirm_window_s: got -1"),
         ((*SINGLE, "detector._target_=os.system"), "detector._target_: got 'os.system'"),
         ((*SINGLE, "slam.only.feature_count=many"), "slam.only.feature_count: got 'many'"),
-        ((*SINGLE, "policy=typo"), "policy: got 'typo', allowed: one of: bayes, default"),
+        ((*SINGLE, "policy=typo"), "policy: got 'typo', allowed: one of bayes, default"),
         ((*SINGLE, "policy.typo=1"), "There is no key policy.typo"),
         ((*SINGLE, "policy={typo: 1}"), "There is no key policy.typo"),
         ((*SINGLE, "scenes={Dark: [only]}"), "use +scenes={Dark: [only]}"),

@@ -128,7 +128,7 @@ def check_node(node: object, key: str, *, allow: Sequence[str], positional: int 
     takes_any = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters)
     for name, value in arguments.items():
         if name not in names and not takes_any:
-            raise ConfigError(f"{key}.{name}", value, f"one of: {', '.join(names) or 'nothing'}")
+            raise ConfigError(f"{key}.{name}", value, f"one of {', '.join(names) or 'nothing'}")
     for parameter in parameters:
         is_required = parameter.default is parameter.empty and parameter.kind in (
             parameter.POSITIONAL_OR_KEYWORD,
