@@ -259,21 +259,37 @@ def test_what_a_hand_over_reports_is_corrected_once(monkeypatch):
     assert_exact(atlas)
 
 
+class JumpingLater(Closing):
+    """It is 1 m off for 1.5 s soon after its loop."""
+
+    def __init__(self, jumps_at):
+        super().__init__(tells=True)
+        self.jumps_at = jumps_at
+
+    def track(self, observation):
+        told, index = super().track(observation), observation.stamp_ns // PERIOD_NS
+        aside = se3.from_xy_yaw(0.0, float(0 <= index - self.jumps_at < 15), 0.0)
+        T_local_base = aside @ told.T_local_base
+        return replace(told, T_local_base=T_local_base, covariance=1e-6 * np.eye(6))
+
+
 @pytest.mark.parametrize("jumps_at", [150, 152, 155, 158])
 def test_a_loop_closed_just_before_a_suspicion_is_applied_once(jumps_at):
-    """The module is 1 m off for 1.5 s; its poses are bridged from before the loop."""
-
-    class Jumping(Closing):
-        def track(self, observation):
-            told, index = super().track(observation), observation.stamp_ns // PERIOD_NS
-            aside = se3.from_xy_yaw(0.0, float(jumps_at <= index < jumps_at + 15), 0.0)
-            T_local_base = aside @ told.T_local_base
-            return replace(told, T_local_base=T_local_base, covariance=1e-6 * np.eye(6))
-
-    modules = {"bright": Jumping(tells=True)}
+    """Its poses are bridged from before the loop."""
+    modules = {"bright": JumpingLater(jumps_at)}
     options = {"handover": "rewind", "gate": GATE, "table": ALONE, "lost_patience_s": 1.0}
     _, atlas, log, _ = drive(modules, steps=240, **options)
     assert len(events(log, "suspect")) == 1 and len(atlas.sessions) == 2
+    assert_exact(atlas)
+
+
+@pytest.mark.parametrize("dark_at", range(143, 147))
+def test_a_hand_over_begins_at_a_pose_that_a_suspicion_replaces_meanwhile(dark_at):
+    modules = {"bright": JumpingLater(152), "dark": ExactModule()}
+    options = {"gate": GATE, "catch_up_steps": 2, "confirm_window_s": 0.5, "handover": "rewind"}
+    _, atlas, log, _ = drive(modules, steps=180, scene_at=dark_from(dark_at), **options)
+    assert len(events(log, "suspect")) == 1
+    assert [to for _, to, _ in decisions(log)] == ["bright", "dark"]
     assert_exact(atlas)
 
 

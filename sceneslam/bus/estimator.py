@@ -215,7 +215,10 @@ class Estimator:
             self._back_end.rewind(trail[0].stamp_ns)
         from_ns = handover.tracked[0].stamp_ns
         posed_ns = min([from_ns, *(one.stamp_ns for one in trail if one.T_map_base is not None)])
-        moved = handover.anchor.T_new_told
+        anchor, kept = handover.anchor, self._memory.last_until(handover.anchor.stamp_ns)
+        if kept is not None and kept.module != anchor.module:
+            anchor = kept  # a suspicion has replaced its pose since
+        moved = anchor.T_new_told
         self._begin_session(newest.stamp_ns, from_ns, posed_ns=posed_ns, jump=jump, moved=moved)
         for tracking in handover.tracked:
             self._back_end.add_local(tracking.stamp_ns, tracking.T_local_base)
