@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from sceneslam.motion.distance_error import DistanceError
 from sceneslam.motion.inertia import Inertia
 from sceneslam.motion.motion import BELIEVED, Motion, Step, motion_of, still
-from sceneslam.motion.trust import LieDetector, NoiseRatio, evidence_of_a_lie
+from sceneslam.motion.trust import EVIDENCE_MAX, LieDetector, NoiseRatio, evidence_of_a_lie
 from sceneslam.motion.turn_errors import TurnErrors
 from sceneslam.types import se3
-from sceneslam.types.covariance import Matrix, updated
+from sceneslam.types.covariance import UNKNOWN_VELOCITY, Matrix, updated
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.se3 import Transform
@@ -33,7 +33,9 @@ _LATE_M, _SPEED_MAX_M_S = 1.0, 25.0  # odometry that moves farther was reset
 _TAUGHT_MIN = 0.25  # least weight of wheels that are probably wrong, in estimating their noise
 _WEAR = 1e-3  # change of the wheels' scale from one scan to the next, as a share of its deviation
 _PLANAR = np.array([0, 1, 5])  # forward, left, yaw
-_COMPARED_S = 0.1  # least interval: an image's noise hides the wheels' errors in a shorter one
+# A motion is compared with that of the wheels once a lie of 0.1 m/s is five times its noise:
+# the noise of two poses does not grow with the time between them.
+_COMPARED_S, _SHOWN = (0.1, 0.5), 0.02  # least and longest interval; noise / UNKNOWN_VELOCITY
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,6 +46,27 @@ class Compared:
     T: Transform
     covariance: Matrix
     wheels: Step
+
+    @property
+    def missed(self) -> NDArray[np.float64]:
+        """Return by how much the wheels differ (3,): forward, left [m], yaw [rad]."""
+        return np.asarray(se3.log(se3.inverse(self.wheels.T) @ self.T)[_PLANAR])
+
+    @property
+    def evidence(self) -> NDArray[np.float64]:
+        """Return the log-likelihood ratios (2,) of wheels that are wrong."""
+        variance = self.wheels.variance + np.diag(self.covariance)[[0, 5]]
+        return evidence_of_a_lie(self.missed[[0, 2]], variance, self.duration_s)
+
+    @property
+    def is_decisive(self) -> bool:
+        """Tell whether the interval is long enough to tell wrong wheels from noise."""
+        least_s, longest_s = _COMPARED_S
+        if not least_s <= self.duration_s < longest_s:
+            return self.duration_s >= longest_s
+        noise = np.sqrt(np.diag(self.covariance)[[0, 5]])
+        is_clear = (noise <= _SHOWN * UNKNOWN_VELOCITY * self.duration_s).all()
+        return bool(is_clear or (self.evidence >= EVIDENCE_MAX).any())
 
     def then(self, later: Compared) -> Compared:
         """Return this motion followed by another; the errors of the pose between them cancel."""
@@ -173,7 +196,7 @@ class MotionModel:
             return
         compared = Compared(duration_s, T_before_now, covariance, wheels)
         self._compared = compared if self._compared is None else self._compared.then(compared)
-        if self._compared.duration_s >= _COMPARED_S:
+        if self._compared.is_decisive:
             self._compare()
 
     def _compare(self) -> None:
@@ -182,11 +205,9 @@ class MotionModel:
         if compared is None:
             return
         wheels = compared.wheels
-        off = se3.log(se3.inverse(wheels.T) @ compared.T)[_PLANAR]
-        measured = compared.covariance[np.ix_(_PLANAR, _PLANAR)]
+        off, measured = compared.missed, compared.covariance[np.ix_(_PLANAR, _PLANAR)]
         if not self._is_weighed:
-            variance = wheels.variance + np.diag(measured)[[0, 2]]
-            self._judge(evidence_of_a_lie(off[[0, 2]], variance, compared.duration_s))
+            self._judge(compared.evidence)
         for channel, axes in enumerate((slice(0, 2), slice(2, 3))):
             R = measured[axes, axes]
             for missed, variance in zip(off[axes].tolist(), np.diag(R).tolist(), strict=True):

@@ -14,7 +14,7 @@ _DOUBT = 10.0  # weight of the prior of a noise, in comparisons
 _MEMORY = 200.0  # comparisons in its posterior, about
 _STUDENT = 4.0  # degrees of freedom: an error of 5 standard deviations has weight 1/6
 _HONEST_S, _LYING_S = 300.0, 5.0  # mean durations of correct and of wrong odometry
-_EVIDENCE_MAX = 3.0  # log-likelihood ratio of one comparison; consecutive ones correlate
+EVIDENCE_MAX = 3.0  # log-likelihood ratio of one comparison; consecutive ones correlate
 _LYING_MAX = 0.999
 
 
@@ -74,7 +74,7 @@ class LieDetector:
 
     def judge(self, evidence: float) -> None:
         """Update by a comparison's log-likelihood ratio, wrong against right."""
-        evidence = min(max(evidence, -_EVIDENCE_MAX), _EVIDENCE_MAX)
+        evidence = min(max(evidence, -EVIDENCE_MAX), EVIDENCE_MAX)
         odds = self.lying / (1.0 - self.lying) * math.exp(evidence)
         self.lying = min(odds / (1.0 + odds), _LYING_MAX)
 
