@@ -139,6 +139,18 @@ def test_a_base_that_is_mounted_askew_stands_askew_whichever_way_it_looks():
     np.testing.assert_allclose(saved.standing(drifted)[:3, 2], (back @ pitched)[:3, 2], atol=1e-3)
 
 
+def test_a_base_that_is_mounted_askew_stands_askew_in_a_map_whose_frame_is_its_first_pose():
+    askew, ahead = se3.exp(1.4 * PITCHED), se3.from_xy_yaw(2.5, 0.0, 0.0)
+    corner = ahead @ se3.from_xy_yaw(0.0, 0.0, 2 * np.pi / 3)
+    steps = [np.eye(4), *[ahead, ahead, corner] * 3, ahead]  # a triangle, and a part of it again
+    flat = np.array(list(accumulate(steps, np.matmul)))
+    nodes = se3.inverse(askew) @ flat @ askew
+    saved = replace(map_of(*[WALL] * len(nodes)), T_map_node=nodes)
+    here = se3.inverse(askew) @ se3.from_xy_yaw(1.0, 0.5, np.pi) @ askew
+    drifted = here @ se3.exp(np.array([0.0, 0.0, 0.0, 0.02, 0.03, 0.0]))
+    assert se3.rotation_angle_rad(se3.inverse(here) @ saved.standing(drifted)) < 0.02
+
+
 def test_above_a_long_ramp_a_robot_stands_level_whichever_way_it_looks():
     ahead, turn = se3.from_xy_yaw(2.5, 0.0, 0.0), se3.from_xy_yaw(0.0, 0.0, np.pi / 2)
     up, level = se3.exp(-PITCHED), se3.exp(PITCHED)
