@@ -117,6 +117,27 @@ def test_a_loop_that_is_found_outside_its_window_is_left_out(monkeypatch, axis):
     assert firsts(2, [0, 0, 1], line(0, 0, 0), SMALL) == []
 
 
+@pytest.mark.parametrize(
+    ("climbed_m", "sigma_m", "is_found"),
+    [(0.6, 0.1, True), (1.1, 0.1, True), (3.0, 0.1, False), (-3.0, 0.1, False), (3.0, 0.6, True)],
+)
+@pytest.mark.parametrize("pitch_rad", [0.0, 0.2])
+def test_no_plans_of_another_storey_are_compared(
+    monkeypatch, climbed_m, sigma_m, is_found, pitch_rad
+):
+    """Base is pitched against the floor, and so is the run's frame."""
+    Compared(monkeypatch)
+    nodes = transforms(line(0, 5, 0))
+    nodes[2, 2, 3] = climbed_m
+    T_level_base = se3.exp(np.array([0.0, 0.0, 0.0, 0.0, pitch_rad, 0.0]))
+    nodes = se3.inverse(T_level_base) @ nodes @ T_level_base
+    up_base = T_level_base[2, :3]
+    submaps = [replace(submap(session), up=up_base) for session in (0, 0, 1)]
+    drift = np.arange(3)[:, None] * [sigma_m, sigma_m, 0.01]
+    query = query_of(2, submaps, nodes, drift)
+    assert (0 in [loop.first for loop in finder_of(()).loops_to(query)]) == is_found
+
+
 def test_no_plans_are_compared_where_the_heading_may_be_off_by_more_than_a_right_angle(monkeypatch):
     Compared(monkeypatch)
     for share in (0.999, 1.001):

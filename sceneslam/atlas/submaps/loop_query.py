@@ -13,7 +13,7 @@ from sceneslam.atlas.submaps.chain import Chain
 from sceneslam.atlas.submaps.graph import on_floor
 from sceneslam.atlas.submaps.path_drift import PathDrift
 from sceneslam.atlas.submaps.submap import Submap
-from sceneslam.atlas.submaps.uprights import by_hand, floor_normal, tilt
+from sceneslam.atlas.submaps.uprights import by_hand, floor_normal, tilt, usual_up
 from sceneslam.graphs.edge import Edge
 from sceneslam.motion.tilt import upright
 from sceneslam.types import planar, se3
@@ -23,6 +23,8 @@ from sceneslam.types.se3 import Transform, Vector
 SIGMAS = 3.0  # of the drift: search range
 GAIN_MIN_M = SIGMAS * 0.02  # a smaller range: recognition cannot improve on so little drift
 NEIGHBOURS = 2  # neighbouring submaps on either side in a target
+_STOREY_M = 1.2  # half of the lowest storey: less is a module's drift in height
+_UP = np.array([0.0, 0.0, 1.0])
 TARGETS = 3  # per submap: three loops to different places outvote a wrong one
 
 # Tells whether a loop may lead from a submap to a later one.
@@ -84,6 +86,13 @@ class LoopQuery:
     def turn_rad(self, first: int | NDArray[np.int64]) -> NDArray[np.float64]:
         """Return by how much [rad] (...) the submap may be turned, as seen from earlier ones."""
         return np.asarray(SIGMAS * self.drift.deviations(first, self.second)[..., 2])
+
+    def is_on_storey(self, first: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Tell which earlier submaps (N,) may lie on the same storey, by the motions and drift."""
+        normal = _UP if self.floor_normal is None else self.floor_normal
+        up = usual_up(self.submaps, self.T_run_node, normal)
+        climbed_m = (self.T_run_node[first, :3, 3] - self.T_run_node[self.second, :3, 3]) @ up
+        return np.abs(climbed_m) <= np.maximum(self.reach_m(first), _STOREY_M)
 
     def on_plane(self, first: int, T_first_second: Planar) -> Transform:
         """Return the motion (4, 4) from an earlier submap, of which the part in the plane is given.

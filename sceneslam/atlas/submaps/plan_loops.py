@@ -61,6 +61,7 @@ class PlanLoops:
         earlier = np.arange(second - 1)
         reach_m = query.reach_m(earlier)
         is_near = (reach_m >= GAIN_MIN_M) & (query.turn_rad(earlier) <= _TURN_MAX_RAD)
+        is_near &= query.is_on_storey(earlier)
         for first in np.flatnonzero(is_near).tolist():
             if not (self._may_close(first, second, submaps) and len(submaps[first].plan)):
                 continue
