@@ -223,15 +223,18 @@ def test_path_stays_short_however_long_the_run(air, sink, monkeypatch):
     np.testing.assert_allclose(steps, steps[0], atol=1e-6)
 
 
-def test_loops_move_the_path(air, sink):
+@pytest.mark.parametrize("shift_s", [0, 60])
+def test_loops_move_the_path(air, sink, shift_s):
+    """The robot's clock may have jumped since: poses are found by the run's."""
     sink.write(seen(0, at(0.0)), at(0.0), "laser")
     sink.write(seen(S, at(1.0)), at(1.0), "laser")
+    sink.write_event({"event": "clock_jump", "stamp_ns": S, "paces": True, "shift_ns": shift_s * S})
     ahead = {0: 0.0, S: 2.0}
 
     def moved(stamps_ns, T_map_base):
         return [at(ahead[ns]) @ T for ns, T in zip(stamps_ns.tolist(), T_map_base, strict=True)]
 
-    sink.write_map(MovedMap(grid=lambda: None, moved=moved))
+    sink.write_map(MovedMap(loaded=None, moved=moved))
     sink.write(seen(3 * S, at(4.0)), at(4.0), "laser")
     xs = [pose.pose.position.x for pose in air.last("/sceneslam/path").poses]
     assert xs == [0.0, 3.0, 4.0]

@@ -9,12 +9,14 @@ from sceneslam.scans.depth_scan import DepthScanner, scan_frame
 from sceneslam.scans.occupancy_grid import OccupancyGrid
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.lens import undistorted_rays
-from sceneslam.types.maps import HybridMap, MovedMap, PointLayer
-from sceneslam.types.observation import Observation
+from sceneslam.types.maps import GridLayer, HybridMap, MovedMap, PointLayer
+from sceneslam.types.observation import LaserScan, Observation
 from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.se3 import Transform, apply, inverse
 
 _KEY_BITS = 21  # of a voxel's index along each axis
+_SCANS = 5000  # at most, 500 m of path; beyond, every second one is left out where it is redrawn
+_BLOCK = 1 << 16  # points that are moved at a time
 _UNSEEN_BGR = (160, 160, 160)  # of points without a camera
 
 
@@ -34,6 +36,10 @@ class GridAndPoints:
     def open(self, rig: Rig) -> None:
         """Start with an empty map."""
         self._rig, self._grid = rig, OccupancyGrid(self._resolution_m)
+        self._loaded: GridLayer | None = None  # beneath the scans
+        self._scans: list[LaserScan] = []
+        self._T_map_laser: list[Transform] = []  # of each scan
+        self._is_moved = False  # so that the grid has to be drawn anew
         self._keys = np.zeros(0, np.int64)  # of the voxels with a point, sorted
         self._points, self._colors = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
         self._owners = np.zeros(0, np.int32)  # of each point: the depth image that it is from
@@ -47,37 +53,59 @@ class GridAndPoints:
         """Add an observation at T_map_base (4, 4) [m]; at its scan's stamp, base was T_map_then."""
         camera, laser = self._rig.camera, self._rig.laser
         if observation.scan is not None and laser is not None:
-            self._grid.insert(T_map_then @ laser.T_base_laser, observation.scan)
+            self._add_scan(observation.scan, T_map_then @ laser.T_base_laser)
         elif observation.depth_m is not None and camera is not None and self._scanner is not None:
             scan = self._scanner.scan(observation.depth_m, stamp_ns=observation.stamp_ns)
-            self._grid.insert(T_map_base @ scan_frame(camera), scan)
+            self._add_scan(scan, T_map_base @ scan_frame(camera))
         if observation.depth_m is not None and camera is not None:
             self._add_depth(observation, T_map_base)
 
     def move(self, moved: MovedMap) -> None:
-        """Move the points with the poses that they were seen from; the grid is drawn anew."""
-        grid = moved.grid()
-        if grid is not None:
-            self._grid = OccupancyGrid.of(grid, self._resolution_m)
+        """Move scans and points with the poses that they were seen from."""
+        self._loaded = None if moved.loaded is None else moved.loaded()
+        self._is_moved = True
+        if self._scans:
+            stamps_ns = np.array([scan.stamp_ns for scan in self._scans], np.int64)
+            self._T_map_laser = list(moved.moved(stamps_ns, np.array(self._T_map_laser)))
         if not self._poses:
             return
         before = np.array(self._poses)
         after = moved.moved(np.array(self._stamps_ns, np.int64), before)
-        T_new_old = (after @ inverse(before))[self._owners]
-        points = np.einsum("nij,nj->ni", T_new_old[:, :3, :3], self._points) + T_new_old[:, :3, 3]
-        colors, owners, self._poses = self._colors, self._owners, list(after)
-        self._keys, self._points = self._keys[:0], self._points[:0]
-        self._colors, self._owners = colors[:0], owners[:0]
-        self._add_points(points.astype(np.float32), colors, owners)
+        T_new_old = (after @ inverse(before)).astype(np.float32)
+        self._poses = list(after)
+        for start in range(0, len(self._points), _BLOCK):
+            block = slice(start, start + _BLOCK)
+            T = T_new_old[self._owners[block]]
+            turned = np.einsum("nij,nj->ni", T[:, :3, :3], self._points[block])
+            self._points[block] = turned + T[:, :3, 3]
+        self._keys = np.unique(self._keys_of(self._points))
 
     def map(self) -> HybridMap:
         """Return a copy of the map."""
+        if self._is_moved:
+            self._draw_scans()
         return HybridMap(
-            points=PointLayer(points=self._points, colors_bgr=self._colors),
+            points=PointLayer(points=self._points.copy(), colors_bgr=self._colors),
             point_modules=np.zeros(len(self._points), np.uint8),
             modules=("map",),
             grid=self._grid.layer(),
         )
+
+    def _add_scan(self, scan: LaserScan, T_map_laser: Transform) -> None:
+        self._scans.append(scan)
+        self._T_map_laser.append(T_map_laser)
+        if len(self._scans) > _SCANS:
+            self._scans, self._T_map_laser = self._scans[::2], self._T_map_laser[::2]
+        if not self._is_moved:
+            self._grid.insert(T_map_laser, scan)
+
+    def _draw_scans(self) -> None:
+        """Draw the grid anew: the loaded map, and the scans on it."""
+        self._is_moved, self._grid = False, OccupancyGrid(self._resolution_m)
+        if self._loaded is not None:
+            self._grid = OccupancyGrid.of(self._loaded, self._resolution_m)
+        for scan, T_map_laser in zip(self._scans, self._T_map_laser, strict=True):
+            self._grid.insert(T_map_laser, scan)
 
     def _add_depth(self, observation: Observation, T_map_base: Transform) -> None:
         camera, depth_m = self._rig.camera, observation.depth_m
@@ -110,11 +138,14 @@ class GridAndPoints:
         owners: NDArray[np.int32],
     ) -> None:
         """Add the points (N, 3) [m], map, of empty voxels, with colours (N, 3) and owners (N,)."""
-        cells = np.floor(points / self._voxel_m).astype(np.int64) + (1 << (_KEY_BITS - 1))
-        keys = (cells[:, 0] << 2 * _KEY_BITS) | (cells[:, 1] << _KEY_BITS) | cells[:, 2]
-        keys, first = np.unique(keys, return_index=True)
+        keys, first = np.unique(self._keys_of(points), return_index=True)
         is_new = ~np.isin(keys, self._keys, assume_unique=True)
         self._keys = np.union1d(self._keys, keys[is_new])
         self._points = np.concatenate([self._points, points[first[is_new]]])
         self._colors = np.concatenate([self._colors, colors[first[is_new]]])
         self._owners = np.concatenate([self._owners, owners[first[is_new]]])
+
+    def _keys_of(self, points: NDArray[np.float32]) -> NDArray[np.int64]:
+        """Return the voxels (N,) of points (N, 3) [m]."""
+        cells = np.floor(points / self._voxel_m).astype(np.int64) + (1 << (_KEY_BITS - 1))
+        return np.asarray((cells[:, 0] << 2 * _KEY_BITS) | (cells[:, 1] << _KEY_BITS) | cells[:, 2])

@@ -55,7 +55,8 @@ class Atlas:
         self._lasting = LastingMap(load=load, save=save, mode=mode, save_every_s=save_every_s)
         self._mapper: Mapper | None = None  # None while only poses are given
         self._note: Note | None = None
-        self._correction = self._shown = Correction.none()
+        # In force now, when the map was shown last, and when that was decided last.
+        self._correction = self._shown = self._compared = Correction.none()
         self._shows_loaded = False  # since the map was shown last
         self._is_over = False  # the correction is of the poses as revised, before: as told
         self._voxel_m = voxel_m
@@ -258,9 +259,10 @@ class Atlas:
     def take_moved(self) -> MovedMap | None:
         """Return the map if loops or a loaded map have moved it visibly since the last call."""
         mapper, was, now = self._mapper, self._shown, self._correction
-        if mapper is None or now is was:
-            return None
         path = self._path
+        if mapper is None or now is self._compared or not path.stamps_ns:
+            return None
+        self._compared = now
         rows = np.searchsorted(path.stamps_ns[:-1], now.stamps_ns)
         T_run_base = np.reshape([path.poses[row] for row in rows], (-1, 4, 4))
         T_was_base, T_now_base = (one.apply(now.stamps_ns, T_run_base) for one in (was, now))
@@ -277,7 +279,8 @@ class Atlas:
             T_was_run = was.apply(stamps_ns, np.tile(se3.identity(), (len(stamps_ns), 1, 1)))
             return now.apply(stamps_ns, se3.inverse(T_was_run) @ T_map_base)
 
-        return MovedMap(grid=mapper.shown(now), moved=moved)
+        loaded = mapper.loaded_grid if mapper.is_placed else None
+        return MovedMap(loaded=loaded, moved=moved)
 
     @property
     def last_covariance(self) -> Covariance | None:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.atlas.lasting.saved_map import SavedMap, empty_map
-from sceneslam.atlas.places.floor_plan import grid_of, join
+from sceneslam.atlas.places.floor_plan import grid_of
 from sceneslam.atlas.places.localizer import Look, MapLocalizer
 from sceneslam.atlas.places.map_search import MapSearch
 from sceneslam.atlas.places.view_taker import ViewTaker
@@ -70,7 +70,7 @@ class Mapper:
         self._scanner, self._known, self._note = KeyScanner(rig), known, note
         self._trail = Trail()
         self._is_rewound = False  # so that the trail is of poses that were replaced
-        views = self._loaded.views()
+        self._plan, views = self._loaded.plan(), self._loaded.views()
         self._views = ViewTaker(rig, is_keeping=keeps_views, is_comparing=bool(views))
         self._collector = Collector(rig, known, self._loaded.runs, self._views.locate)
         self._executor = executor("search", is_live=is_live)
@@ -108,6 +108,11 @@ class Mapper:
     def is_found(self) -> bool:
         """Tell whether the run was located in the loaded map, or no map was loaded."""
         return self.is_placed or not self._loaded.submaps
+
+    def loaded_grid(self) -> GridLayer | None:
+        """Return the grid of the loaded map, None without walls; may be called in any thread."""
+        plan = self._plan
+        return grid_of(plan) if len(plan) or plan.free.any() else None
 
     @property
     def T_map_run(self) -> Transform:
@@ -277,24 +282,6 @@ class Mapper:
         saved = saved.without_guesses()
         return saved.without_misfits() if self._is_over else saved
 
-    def shown(self, correction: Correction) -> Callable[[], GridLayer | None]:
-        """Return what draws the map so far, in any thread: its walls, where poses are corrected.
-
-        With the loaded map, if the run is located in it; None if there is nothing to draw.
-        """
-        submaps, T_run_node = self._collector.grown()
-        stamps_ns = np.array([submap.stamps_ns[0] for submap in submaps], np.int64)
-        plane = planar.from_transforms(correction.apply(stamps_ns, T_run_node))
-
-        def grid() -> GridLayer | None:
-            before = self._loaded.plans() if is_placed else []
-            own = [(T, submap.plan) for T, submap in zip(plane, submaps, strict=True)]
-            plan = join([*before, *own], newest_wins=True)
-            return grid_of(plan) if len(plan) or plan.free.any() else None
-
-        is_placed = self.is_placed
-        return grid
-
     def _own_pieces(self, loops: Sequence[Edge]) -> NDArray[np.int64]:
         """Return the piece of each submap of the run, by the parts that loops join.
 
@@ -397,7 +384,7 @@ class Mapper:
         self, rig: Rig, views: Sequence[tuple[Transform, Landmarks]]
     ) -> MapLocalizer | None:
         """Return the localizer in the loaded map, None if no sensor sees what it shows."""
-        plan, finder = self._loaded.plan(), None
+        plan, finder = self._plan, None
         if views and rig.camera is not None and Sensor.IMAGE in rig.sensors:
             finder = ViewFinder(rig.camera, views)
         if finder is None and not (len(plan) and self._scanner.can_scan):

@@ -20,6 +20,7 @@ from sceneslam.types.trail import Trail
 
 _log = logging.getLogger(__name__)
 _STEP_M, _STEP_RAD = 0.1, 0.1  # smallest motion between two observations in the map
+_REST = 4.0  # times as long as a map takes: the run needs the processor
 NOTHING = HybridMap(
     points=PointLayer(points=np.zeros((0, 3), np.float32)),
     point_modules=np.zeros(0, np.uint8),
@@ -118,9 +119,10 @@ class LiveMap:
                         self._T_map_drawn = None if self._moved else waiting[1]
                     is_changed = True
                 if is_changed and monotonic() >= due_s:
-                    due_s, is_changed = monotonic() + self._every_s, False
+                    began_s, is_changed = monotonic(), False
                     self._newest = self._mapper.map()
                     self._publish(self._newest)
+                    due_s = monotonic() + max(self._every_s, _REST * (monotonic() - began_s))
             except Exception as error:  # the next observation may be drawn
                 _log.debug("the live map", exc_info=error)
                 if self._error is None:

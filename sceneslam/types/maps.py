@@ -119,6 +119,6 @@ def _log_odds(probability: float) -> float:
 class MovedMap:
     """Where loops, or a loaded map, have moved what was drawn of a run. In `map`, in any thread."""
 
-    grid: Callable[[], GridLayer | None]  # draws the map so far, None: no sensor saw walls
+    loaded: Callable[[], GridLayer | None] | None  # draws the loaded map if the run is found in it
     # Where poses (N, 4, 4) of these stamps (N,), as they were reported, are now.
     moved: Callable[[NDArray[np.int64], NDArray[np.float64]], NDArray[np.float64]]

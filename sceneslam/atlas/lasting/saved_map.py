@@ -67,11 +67,11 @@ class SavedMap:
 
     def plan(self, piece: int = 0) -> FloorPlan:
         """Return the floor plan of a piece, in its frame; raises InputError as `check_size`."""
-        return join(self.plans(piece), newest_wins=True)
+        return join(self._placed(piece), newest_wins=True)
 
     def check_size(self) -> None:
         """Raise InputError if the plan of the first piece, which runs load, is too large."""
-        check_size(self.plans())
+        check_size(self._placed(0))
 
     def views(self, piece: int = 0) -> list[tuple[Transform, Landmarks]]:
         """Return what a camera saw in a piece, and T_map_cam (4, 4) where it was seen from."""
@@ -194,7 +194,7 @@ class SavedMap:
             ),
         )
 
-    def plans(self, piece: int = 0) -> list[tuple[Planar, FloorPlan]]:
+    def _placed(self, piece: int) -> list[tuple[Planar, FloorPlan]]:
         """Return the plans of a piece with their poses in its frame, oldest first."""
         plane = self.plane
         return [(plane[node], self.submaps[node].plan) for node in self.nodes(piece)]

@@ -14,7 +14,6 @@ from sceneslam.atlas.submaps.submap import (
     STEP_RAD,
     KeyPose,
     OpenSubmap,
-    Submap,
     make_submap,
     motion_covariance,
 )
@@ -131,14 +130,6 @@ class Collector:
         """
         self._waiting.append((stamp_ns, scan, up_base, view))
         self._take()
-
-    def grown(self) -> tuple[list[Submap], NDArray[np.float64]]:
-        """Return all submaps, with the one that grows, and their poses (N, 4, 4) in the run."""
-        submaps, poses, growing = [*self.chain.submaps], [*self.chain.T_run_node], self._open.poses
-        if growing:
-            submaps.append(make_submap(growing, self._run, self.chain.T_base_cam))
-            poses.append(growing[0].T_map_base)
-        return submaps, np.reshape(poses, (-1, 4, 4))
 
     def rewind(self, stamp_ns: int) -> None:
         """Remove the submaps with poses from a stamp on; their steps wait for new poses.

@@ -98,6 +98,7 @@ class TopicSink:
         self._shift_ns = 0  # offset of the run's stamps to the robot's
         self._covariance: NDArray[np.float64] | None = None
         self._stamps_ns: list[int] = []
+        self._run_ns: list[int] = []  # the same by the run's clock, which never jumps
         self._poses: list[Transform] = []  # T_map_base
         self._path_step = 1  # every so many poses, one is in the path
         self._count, self._slow_ns = 0, -_SLOW_NS
@@ -135,7 +136,7 @@ class TopicSink:
                 marks_twist=True,
             )
             self.send(ODOMETRY, odometry)
-            self._keep(stamp_ns, T_map_base)
+            self._keep(stamp_ns, observation.stamp_ns, T_map_base)
             self._live_map.add(observation, T_map_base)
         self._say(MODULE, module)
         if observation.stamp_ns - self._slow_ns >= _SLOW_NS:
@@ -147,7 +148,7 @@ class TopicSink:
         """Correct what was drawn of the map, and the path."""
         self._live_map.move(moved)
         if self._poses:
-            stamps_ns = np.array(self._stamps_ns, np.int64) + self._shift_ns
+            stamps_ns = np.array(self._run_ns, np.int64)
             self._poses = list(moved.moved(stamps_ns, np.array(self._poses)))
 
     def write_event(self, event: Event) -> None:
@@ -208,13 +209,15 @@ class TopicSink:
         message = self.encoder.transforms(at_ns, self._map_frame, {child: T_frame_child})
         self.send(names.TF, message)
 
-    def _keep(self, stamp_ns: int, T_map_base: Transform) -> None:
+    def _keep(self, stamp_ns: int, run_ns: int, T_map_base: Transform) -> None:
         if self._count % self._path_step == 0:
             self._stamps_ns.append(stamp_ns)
+            self._run_ns.append(run_ns)
             self._poses.append(T_map_base)
         self._count += 1
         if len(self._poses) > _PATH_POSES:
-            self._stamps_ns, self._poses = self._stamps_ns[::2], self._poses[::2]
+            self._stamps_ns, self._run_ns = self._stamps_ns[::2], self._run_ns[::2]
+            self._poses = self._poses[::2]
             self._path_step *= 2
 
     def _send_path(self) -> None:
