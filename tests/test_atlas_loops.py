@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from planar_poses import transforms
-from test_atlas_maps import Found, carried, edge
+from test_atlas_maps import Found, carried, edge, map_of
 from test_atlas_places import CELL, plan_of, quality
 
 from sceneslam.atlas.lasting.saved_map import empty_map
@@ -293,6 +293,21 @@ def test_a_loop_by_plans_closes_the_climb_of_a_base_that_is_mounted_askew(pitch_
     off = se3.log(se3.inverse(due) @ found)
     assert np.abs(off[2]) < 2e-6  # the odometry is off by 0.08 and 0.2 m
     assert np.abs(off[3:5]).max() < 1e-9
+
+
+@pytest.mark.parametrize(("roll_rad", "pitch_rad"), [(0.17, 0.17), (0.03, 0.35), (-0.1, 0.1)])
+def test_a_base_that_is_mounted_askew_in_two_axes_is_placed_as_its_plans_are(roll_rad, pitch_rad):
+    roll, pitch = (
+        se3.exp(np.roll([angle, 0, 0, 0, 0, 0], k)) for k, angle in ((3, roll_rad), (4, pitch_rad))
+    )
+    mount = pitch @ roll  # has no yaw
+    nodes = [se3.from_xy_yaw(2 * np.sin(k), -2 * np.cos(k), k) @ mount for k in range(12)]
+    query = query_along(nodes)
+    found = query.on_plane(2, planar.between(query.plane[2], query.plane[-1]))
+    np.testing.assert_allclose(found, se3.inverse(nodes[2]) @ nodes[-1], atol=1e-6)
+    saved = replace(map_of(*[WALL] * 12, edges=query.motions), T_map_node=np.array(nodes))
+    here = planar.to_transform(np.array([1.0, 0.5, 2.0]))
+    np.testing.assert_allclose(saved.standing(here), here @ mount, atol=1e-6)
 
 
 @pytest.mark.parametrize("tilt_rad", [0.0, 0.15])

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sceneslam.atlas.places.floor_plan import FloorPlan, check_size, join
 from sceneslam.atlas.submaps.graph import connected, fits
 from sceneslam.atlas.submaps.submap import Drawing, Submap
-from sceneslam.atlas.submaps.uprights import are_on_floor, are_steady, turning_axis, usual_up
+from sceneslam.atlas.submaps.uprights import are_on_floor, are_steady, mount, turning_axis, usual_up
 from sceneslam.graphs.edge import Edge, EdgeKind
 from sceneslam.motion.tilt import upright
 from sceneslam.types import planar, se3
@@ -149,7 +149,7 @@ class SavedMap:
         """
         own = self.nodes(piece)
         nodes = self.T_map_node[own]
-        askew = upright(se3.identity(), turning_axis(nodes))
+        askew = mount(turning_axis(nodes))
         ups_base = (np.tile(T[2, :3], (len(nodes), 1)) for T in (askew, se3.identity()))
         if not are_steady(nodes, *ups_base):
             askew = se3.identity()
@@ -161,7 +161,7 @@ class SavedMap:
             T_map_floor = se3.inverse(level) @ upright(level @ T_map_floor, _UP)
             askew = se3.identity()
         floor = planar.from_transform(T_map_floor)
-        base = planar.from_transform(T_map_base @ se3.inverse(askew))
+        base = planar.from_transform(T_map_base)
         stood = T_map_floor @ planar.to_transform(planar.between(floor, base)) @ askew
         stood[:2, 3] = T_map_base[:2, 3]
         return np.asarray(stood)

@@ -13,9 +13,8 @@ from sceneslam.atlas.submaps.chain import Chain
 from sceneslam.atlas.submaps.graph import on_floor
 from sceneslam.atlas.submaps.path_drift import PathDrift
 from sceneslam.atlas.submaps.submap import Submap
-from sceneslam.atlas.submaps.uprights import by_hand, floor_normal, tilt, usual_up
+from sceneslam.atlas.submaps.uprights import by_hand, floor_normal, mount, tilt, usual_up
 from sceneslam.graphs.edge import Edge
-from sceneslam.motion.tilt import upright
 from sceneslam.types import planar, se3
 from sceneslam.types.planar import Matrix, Planar
 from sceneslam.types.se3 import Transform, Vector
@@ -100,7 +99,7 @@ class LoopQuery:
         On a floor height and tilt do not change; by hand they do as the motions alone say.
         """
         if self.floor_normal is not None:
-            T_level_base = upright(se3.identity(), self.floor_normal)
+            T_level_base = mount(self.floor_normal)
             T_base_level = se3.inverse(T_level_base)
             return np.asarray(T_base_level @ planar.to_transform(T_first_second) @ T_level_base)
         lies, found = self.plane[self.second], planar.compose(self.plane[first], T_first_second)

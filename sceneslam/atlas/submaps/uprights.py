@@ -94,6 +94,12 @@ def floor_normal(
     return None
 
 
+def mount(up_base: Vector) -> Transform:
+    """Return the roll and pitch (4, 4) of a base in which `up_base` (3,) points upwards."""
+    T = upright(se3.identity(), up_base)
+    return se3.from_xy_yaw(0.0, 0.0, -se3.yaw_rad(T)) @ T
+
+
 def turning_axis(T_map_node: NDArray[np.float64]) -> Vector:
     """Return the direction (3,) in nodes (N, 4, 4) that changes least in the map.
 
