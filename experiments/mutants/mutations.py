@@ -61,7 +61,7 @@ def component_mutants(subject: Subject, part: Path, rng: np.random.Generator) ->
         mutant = subject.put("null", part, None)
         names = (*mutant.named, part[0])  # `slam: got nothing` where it was the only module
         yield subject.mutant(mutant.kind, mutant.change, mutant.config, *names)
-    for path in walk(node, part):
+    for path in walk(at(subject.composed, part), part):  # what a `${...}` holds is changed there
         if path[-1] == TARGET:
             continue
         value = at(subject.resolved, path)
