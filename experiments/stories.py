@@ -23,7 +23,9 @@ def row(folder: Path) -> list[str]:
     """Return one run's line."""
     metrics = json.loads((folder / "metrics.json").read_text())
     words = json.loads((folder / "job.json").read_text())["overrides"]
-    scenario = next(w.partition("=")[2] for w in words if w.lstrip("+").startswith("scenario="))
+    named = (w.partition("=")[2] for w in words if w.lstrip("+").startswith("scenario="))
+    if not (scenario := next(named, "")):
+        raise SystemExit(f"error: expected runs of +scenario=NAME, got {words}: {folder}")
     return [
         scenario,
         f"{metrics['path_length_m']:.1f}",
@@ -47,10 +49,9 @@ def main(sweep: Path) -> None:
     found = sorted(sweep.glob("*/metrics.json"), key=lambda path: int(path.parent.name))
     if not found:
         raise SystemExit(f"error: no run in the folder of a sweep: {sweep}")
+    rows = [row(path.parent) for path in found]  # before the old table is gone
     with OUT.open("w", newline="") as file:
-        csv.writer(file, lineterminator="\n").writerows(
-            [COLUMNS, *(row(path.parent) for path in found)]
-        )
+        csv.writer(file, lineterminator="\n").writerows([COLUMNS, *rows])
 
 
 if __name__ == "__main__":
