@@ -45,7 +45,8 @@ def test_bright_to_dark_is_one_switch_and_an_accurate_trajectory(runs):
     assert (switch["from"], switch["to"], switch["scene"]) == ("bright", "dark", "Dark")
     assert 1.4 <= switch["confirm_delay_s"] <= 2.3 and switch["gap_s"] == 0.0  # 1.8
     assert metrics["coverage"] == 1.0 and metrics["false_switches"] == 0
-    # 1.5 times the largest over seeds 50 to 57: 0.0072 m, 0.0050 rad, 1.0037.
+    # 1.5 times what was measured: 0.0071 m, 0.0050 rad (seeds 50 to 55: 0.0032 to 0.0085 m), and
+    # the largest length of seeds 50 to 57, 1.0037.
     assert metrics["ate_rmse_m"] <= 0.0108 and metrics["ate_rot_rad"] <= 0.0075
     assert abs(metrics["length_ratio"] - 1.0) <= 0.0056
 
