@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 from sceneslam.types import se3
 from sceneslam.types.rig import Sensor
-from sceneslam.types.run import BRIDGED
 
 
 def test_module_lost_right_after_the_switch_is_survived():
@@ -152,29 +151,3 @@ def test_trajectory_is_continuous_wherever_the_switch_and_the_losses_fall(switch
     _, atlas, _, _ = drive(modules, steps=80, scene_at=dark_from(switch), confirm_window_s=0.5)
     assert len(atlas.trajectory) == 80
     assert_exact(atlas)
-
-
-@pytest.mark.parametrize("startup_s", [{"slow": 8.0}, {"slow": 8.0, "quick": 1.0}])
-def test_a_module_that_starts_slowly_does_not_keep_another_from_a_lost_robot(startup_s):
-    modules = {
-        "bright": ExactModule(lost=range(60, 1000)),
-        "slow": ExactModule(),
-        "quick": ExactModule(),
-    }
-    table = {"Bright": ["bright"], "Dark": ["slow", "quick"]}
-    _, atlas, log, _ = drive(
-        modules,
-        steps=200,
-        table=table,
-        scene_at=dark_from(30),
-        has_odometry=False,
-        handover="rewind",
-        startup_s=startup_s,
-        retry_s=2.0,
-        lost_patience_s=1.0,
-    )
-    decisions = [(one["to"], one["stamp_ns"] / 1e9) for one in events(log, "decision")]
-    assert [key for key, _ in decisions] == ["bright", "quick", "slow"]
-    assert decisions[1][1] <= 6.0 + 1.0 + 1.2 and decisions[2][1] <= 15.0
-    assert modules["slow"].activations == 1
-    assert BRIDGED not in atlas.pose_modules[-60:]

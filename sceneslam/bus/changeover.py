@@ -139,11 +139,9 @@ class Changeover:
 
         `since_ns`: when the scene that calls for it began, None for another reason.
         """
-        if self._trial is not None:
-            is_useful = self._tracked_ns > 0 or self._trial.handover is None  # tracks, or starts
-            is_useful &= verdict.reason != "scene"  # that begins in the past
-            if not (is_useful and self._trial.runner.key in verdict.to[:1]):
-                self._drop_trial()
+        is_ready = self._tracked_ns > 0 and verdict.reason != "scene"  # that begins in the past
+        if self._trial is not None and not (is_ready and self._trial.runner.key in verdict.to[:1]):
+            self._drop_trial()
         self._now, self._verdict, self._since_ns = now, verdict, since_ns
         self.queue = list(verdict.to)
 
@@ -162,11 +160,9 @@ class Changeover:
                 self._attempt = self._start(runner)
                 self._attempt.from_ns = from_ns
             is_accepted = self._lead(self._attempt)
-            if is_accepted is None and self._keeps_waiting():
+            if is_accepted is None:
                 return None
             key, self._attempt = self._attempt.runner.key, None
-            if is_accepted is None:
-                continue
             if is_accepted:
                 is_best = self.is_first or key == self._verdict.to[0]
                 return Outcome.SUCCESS if is_best else Outcome.FAILURE
@@ -178,25 +174,6 @@ class Changeover:
         elif active is not None and self._verdict.reason == "scene":
             self.tell_scene()
         return Outcome.FAILURE
-
-    def _keeps_waiting(self) -> bool:
-        """Tell whether the candidate is waited for; else it starts on standby, if it still does.
-
-        It is not once poses are missing and another candidate may give them.
-        """
-        attempt, session = self._attempt, self._estimator.session
-        assert attempt is not None
-        unheld_ns = session.hold.unheld_since_ns
-        if attempt.handover is not None or self._trial is not None or not self.queue:
-            return True
-        if self._policy.handover == "cold" or session.runner is None or unheld_ns is None:
-            return True
-        if self._runners[self.queue[0]] is self._estimator.active:
-            return True
-        if self._estimator.now_ns - unheld_ns < session.hold.patience_ns:
-            return True
-        attempt.is_trial, self._trial = True, attempt
-        return False
 
     def why_over(self, scene: str) -> str:
         """Return why the change that has begun is wanted no longer, now in a scene; "" if it is.
