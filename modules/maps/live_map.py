@@ -15,7 +15,7 @@ from sceneslam.types.rig import Rig, Sensor
 from sceneslam.types.se3 import Transform, apply, inverse
 
 _KEY_BITS = 21  # of a voxel's index along each axis
-_SCANS = 5000  # at most, 500 m of path; beyond, every second one is left out where it is redrawn
+_SCANS = 5000  # kept at most, as of 500 m of path; beyond, half as many for any metre of it
 _BLOCK = 1 << 16  # points that are moved at a time
 _UNSEEN_BGR = (160, 160, 160)  # of points without a camera
 
@@ -39,6 +39,7 @@ class GridAndPoints:
         self._loaded: GridLayer | None = None  # beneath the scans
         self._scans: list[LaserScan] = []
         self._T_map_laser: list[Transform] = []  # of each scan
+        self._count, self._step = 0, 1  # scans so far; every so many, one is kept
         self._is_moved = False  # so that the grid has to be drawn anew
         self._keys = np.zeros(0, np.int64)  # of the voxels with a point, sorted
         self._points, self._colors = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
@@ -92,10 +93,13 @@ class GridAndPoints:
         )
 
     def _add_scan(self, scan: LaserScan, T_map_laser: Transform) -> None:
-        self._scans.append(scan)
-        self._T_map_laser.append(T_map_laser)
+        if self._count % self._step == 0:
+            self._scans.append(scan)
+            self._T_map_laser.append(T_map_laser)
+        self._count += 1
         if len(self._scans) > _SCANS:
             self._scans, self._T_map_laser = self._scans[::2], self._T_map_laser[::2]
+            self._step *= 2
         if not self._is_moved:
             self._grid.insert(T_map_laser, scan)
 
