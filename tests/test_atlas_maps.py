@@ -149,6 +149,8 @@ def test_a_base_that_is_mounted_askew_stands_askew_in_a_map_whose_frame_is_its_f
     here = se3.inverse(askew) @ se3.from_xy_yaw(1.0, 0.5, np.pi) @ askew
     drifted = here @ se3.exp(np.array([0.0, 0.0, 0.0, 0.02, 0.03, 0.0]))
     assert se3.rotation_angle_rad(se3.inverse(here) @ saved.standing(drifted)) < 0.02
+    for node, T_plane in zip(nodes, map(planar.to_transform, saved.plane), strict=True):
+        assert se3.rotation_angle_rad(se3.inverse(node) @ saved.standing(T_plane)) < 2e-3
 
 
 def test_above_a_long_ramp_a_robot_stands_level_whichever_way_it_looks():

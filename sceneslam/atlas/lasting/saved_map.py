@@ -153,14 +153,15 @@ class SavedMap:
         ups_base = (np.tile(T[2, :3], (len(nodes), 1)) for T in (askew, se3.identity()))
         if not are_steady(nodes, *ups_base):
             askew = se3.identity()
-        T_map_floor = self.T_map_node[self.nearest(T_map_base, piece)] @ se3.inverse(askew)
+        T_map_nearest = self.T_map_node[self.nearest(T_map_base, piece)]
+        T_map_floor = T_map_nearest @ se3.inverse(askew)
+        floor = planar.from_transform(T_map_nearest)  # as its plan is placed
         up_map = usual_up([self.submaps[node] for node in own], nodes, askew[2, :3])
         edges = [edge for edge in self.edges if self.pieces[edge.first] == piece]
         if not are_on_floor(edges, self.T_map_node, askew[2, :3], up_map):
             level = upright(se3.identity(), up_map)
             T_map_floor = se3.inverse(level) @ upright(level @ T_map_floor, _UP)
-            askew = se3.identity()
-        floor = planar.from_transform(T_map_floor)
+            askew, floor = se3.identity(), planar.from_transform(T_map_floor)
         base = planar.from_transform(T_map_base)
         stood = T_map_floor @ planar.to_transform(planar.between(floor, base)) @ askew
         stood[:2, 3] = T_map_base[:2, 3]
