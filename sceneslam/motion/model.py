@@ -35,7 +35,7 @@ _WEAR = 1e-3  # change of the wheels' scale from one scan to the next, as a shar
 _PLANAR = np.array([0, 1, 5])  # forward, left, yaw
 # A motion is compared with that of the wheels once a lie of 0.1 m/s is five times its noise:
 # the noise of two poses does not grow with the time between them.
-_COMPARED_S, _SHOWN = (0.1, 0.5), 0.02  # least and longest interval; noise / UNKNOWN_VELOCITY
+_COMPARED_S, _SHOWN = (0.1, 0.3), 0.02  # least and longest interval; noise / UNKNOWN_VELOCITY
 
 
 @dataclass(frozen=True, slots=True, eq=False)
