@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -36,7 +38,7 @@ class GridAndPoints:
     def open(self, rig: Rig) -> None:
         """Start with an empty map."""
         self._rig, self._grid = rig, OccupancyGrid(self._resolution_m)
-        self._loaded: GridLayer | None = None  # beneath the scans
+        self._loaded: Callable[[], GridLayer | None] | None = None  # draws what is beneath scans
         self._scans: list[LaserScan] = []
         self._T_map_laser: list[Transform] = []  # of each scan
         self._count, self._step = 0, 1  # scans so far; every so many, one is kept
@@ -63,8 +65,7 @@ class GridAndPoints:
 
     def move(self, moved: MovedMap) -> None:
         """Move scans and points with the poses that they were seen from."""
-        self._loaded = None if moved.loaded is None else moved.loaded()
-        self._is_moved = True
+        self._loaded, self._is_moved = moved.loaded, True
         if self._scans:
             stamps_ns = np.array([scan.stamp_ns for scan in self._scans], np.int64)
             self._T_map_laser = list(moved.moved(stamps_ns, np.array(self._T_map_laser)))
@@ -105,9 +106,9 @@ class GridAndPoints:
 
     def _draw_scans(self) -> None:
         """Draw the grid anew: the loaded map, and the scans on it."""
-        self._is_moved, self._grid = False, OccupancyGrid(self._resolution_m)
-        if self._loaded is not None:
-            self._grid = OccupancyGrid.of(self._loaded, self._resolution_m)
+        loaded, cell_m = None if self._loaded is None else self._loaded(), self._resolution_m
+        self._grid = OccupancyGrid(cell_m) if loaded is None else OccupancyGrid.of(loaded, cell_m)
+        self._is_moved = False
         for scan, T_map_laser in zip(self._scans, self._T_map_laser, strict=True):
             self._grid.insert(T_map_laser, scan)
 
