@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from sceneslam.types import se3
 from sceneslam.types.rig import Sensor
+from sceneslam.types.run import BRIDGED
 
 
 def test_module_lost_right_after_the_switch_is_survived():
@@ -151,3 +152,40 @@ def test_trajectory_is_continuous_wherever_the_switch_and_the_losses_fall(switch
     _, atlas, _, _ = drive(modules, steps=80, scene_at=dark_from(switch), confirm_window_s=0.5)
     assert len(atlas.trajectory) == 80
     assert_exact(atlas)
+
+
+@pytest.mark.parametrize("startup_s", [{"slow": 8.0}, {"slow": 8.0, "quick": 1.0}])
+def test_a_module_that_starts_slowly_does_not_keep_another_from_a_lost_robot(startup_s):
+    modules = {
+        "bright": ExactModule(lost=range(60, 1000)),
+        "slow": ExactModule(),
+        "quick": ExactModule(),
+    }
+    table = {"Bright": ["bright"], "Dark": ["slow", "quick"]}
+    _, atlas, log, _ = drive(
+        modules,
+        steps=200,
+        table=table,
+        scene_at=dark_from(30),
+        has_odometry=False,
+        handover="rewind",
+        startup_s=startup_s,
+        retry_s=2.0,
+        lost_patience_s=1.0,
+    )
+    decisions = [(one["to"], one["stamp_ns"] / 1e9) for one in events(log, "decision")]
+    assert [key for key, _ in decisions] == ["bright", "quick", "slow"]
+    assert decisions[1][1] <= 6.0 + 1.0 + 1.2 and decisions[2][1] <= 15.0
+    assert modules["slow"].activations == 1
+    assert BRIDGED not in atlas.pose_modules[-60:]
+
+
+@pytest.mark.parametrize("fault", ["lost", "raises"])
+def test_what_started_beside_a_slow_module_and_failed_leaves_that_to_take_over(fault):
+    quick = ExactModule(**{fault: range(1000)})
+    modules = {"bright": ExactModule(lost=range(60, 1000)), "slow": ExactModule(), "quick": quick}
+    table = {"Bright": ["bright"], "Dark": ["slow", "quick"]}
+    options = {"handover": "rewind", "startup_s": {"slow": 8.0}, "lost_patience_s": 1.0}
+    bus, _, log, _ = drive(modules, steps=200, table=table, scene_at=dark_from(30), **options)
+    assert [one["to"] for one in events(log, "refused") + events(log, "decision")][0] == "quick"
+    assert bus.active == "slow" and modules["slow"].activations == 1

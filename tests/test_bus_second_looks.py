@@ -416,8 +416,8 @@ def test_a_catch_up_holds_no_more_images_than_the_buffer():
 
     def images_mb(bus):
         held = [each.observation for each in bus._estimator._memory.after(-1)]
-        handover = bus._changeover._attempt and bus._changeover._attempt.handover
-        held += [each.observation for each in handover.trail] if handover else []
+        handovers = [one.handover for one in bus._changeover._attempts if one.handover]
+        held += [each.observation for handover in handovers for each in handover.trail]
         images = {id(each.image_bgr): each.image_bgr for each in held}
         return sum(image.nbytes for image in images.values() if image is not None) / 1e6
 

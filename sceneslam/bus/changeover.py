@@ -85,6 +85,7 @@ class _Attempt:
     """A candidate that is being started."""
 
     runner: Runner
+    since_ns: int  # when it became a candidate
     ready_ns: int  # when it may be started
     is_trial: bool = False  # it began on standby beside the fallback
     is_begun: bool = False  # it is being started, or was
@@ -113,7 +114,7 @@ class Changeover:
         self._verdict: Decision
         self._since_ns: int | None  # when the scene that calls for it began
         self.queue: list[str] = []  # its candidates that were not tried yet
-        self._attempt: _Attempt | None = None
+        self._attempts: list[_Attempt] = []  # best first
         self._trial: _Attempt | None = None
 
     @property
@@ -139,35 +140,38 @@ class Changeover:
 
         `since_ns`: when the scene that calls for it began, None for another reason.
         """
-        is_ready = self._tracked_ns > 0 and verdict.reason != "scene"  # that begins in the past
-        if self._trial is not None and not (is_ready and self._trial.runner.key in verdict.to[:1]):
-            self._drop_trial()
+        if self._trial is not None and self._trial.handover is not None:
+            is_ready = self._tracked_ns > 0 and verdict.reason != "scene"  # that begins in the past
+            if not (is_ready and self._trial.runner.key in verdict.to[:1]):
+                self._drop_trial()
         self._now, self._verdict, self._since_ns = now, verdict, since_ns
         self.queue = list(verdict.to)
 
     def go_on(self) -> Outcome | None:
-        """Advance the change by one candidate or one observation; return None until it is over."""
-        while self._attempt is not None or self.queue:
-            if self._attempt is None:
-                runner = self._runners[self.queue.pop(0)]
-                from_ns = None
-                if runner is self._estimator.active:
-                    from_ns = self._estimator.session.hold.adrift_since_ns
-                    is_adrift = self._verdict.reason == Health.LOST and from_ns is not None
-                    if not runner.is_failed and not is_adrift:
-                        break  # the active module stays, as the fallback
-                    self._estimator.retire()  # before it is started again
-                self._attempt = self._start(runner)
-                self._attempt.from_ns = from_ns
-            is_accepted = self._lead(self._attempt)
-            if is_accepted is None:
+        """Advance the change by one candidate or one observation; return None until it is over.
+
+        Beside one that keeps a lost robot waiting while it starts, the next starts as well; the
+        first that can takes over.
+        """
+        while self._attempts or self.queue:
+            if (not self._attempts or self._is_late()) and not self._start_next():
+                break
+            for attempt in sorted(self._attempts, key=lambda one: one.handover is None):
+                is_accepted = self._lead(attempt)
+                if is_accepted is None and attempt.handover is not None:
+                    return None  # one at a time catches up
+                if is_accepted is None:
+                    continue
+                self._attempts.remove(attempt)
+                key = attempt.runner.key
+                if is_accepted:
+                    self._leave_others()
+                    is_best = self.is_first or key == self._verdict.to[0]
+                    return Outcome.SUCCESS if is_best else Outcome.FAILURE
+                if self.is_first:
+                    return Outcome.FAILURE  # the machine enters `start` again, with the next one
+            if self._attempts:
                 return None
-            key, self._attempt = self._attempt.runner.key, None
-            if is_accepted:
-                is_best = self.is_first or key == self._verdict.to[0]
-                return Outcome.SUCCESS if is_best else Outcome.FAILURE
-            if self.is_first:
-                return Outcome.FAILURE  # the machine enters `start` again, with the next candidate
         active = self._estimator.active
         if active is not None and active.is_failed:
             self._estimator.retire()
@@ -182,7 +186,7 @@ class Changeover:
         the module that starts at all; or the loss is over: the old module has tracked for as long
         as it may be lost.
         """
-        if self._attempt is None:
+        if not self._attempts:
             return ""
         hold, is_held = self._estimator.session.hold, self._estimator.session.health is Health.HELD
         held_ns = self._estimator.now_ns - (hold.held_since_ns or self._estimator.now_ns)
@@ -191,15 +195,15 @@ class Changeover:
         choices = self._candidates.of(scene)
         if scene == self._candidates.scene or not choices or choices[:1] == self._verdict.to[:1]:
             return ""
-        is_useless = self._attempt.runner.key not in choices
+        is_useless = all(attempt.runner.key not in choices for attempt in self._attempts)
         return "the scene is over" if is_held or is_useless else ""
 
     def give_up(self, why: str) -> None:
         """End the change; the active module stays."""
         self.queue = []
-        if self._attempt is not None:
-            self._log_choice("refused", self._attempt.runner.key, why=why)
-        self._end_attempt()
+        for attempt in self._attempts:
+            self._log_choice("refused", attempt.runner.key, why=why)
+        self._end_attempts()
 
     def tell_scene(self) -> None:
         """Inform the active module, which stays, of the scene that it serves now."""
@@ -211,8 +215,7 @@ class Changeover:
 
     def begin_trial(self, key: str) -> None:
         """Run the scene's first choice on standby beside the fallback; its poses are not used."""
-        ready_ns = self._ready_ns(key)
-        self._trial = _Attempt(runner=self._runners[key], ready_ns=ready_ns, is_trial=True)
+        self._trial = self._new_attempt(self._runners[key], is_trial=True)
         self.try_on()
 
     def submit(self, observation: Observation) -> None:
@@ -230,8 +233,7 @@ class Changeover:
         trial = self._trial
         if trial is None:
             return
-        first = self._candidates.of(self._candidates.scene)[:1]
-        if first != (trial.runner.key,) and not trial.runner.is_failed:
+        if not self._is_first_choice(trial) and not trial.runner.is_failed:
             self._drop_trial()
             return
         try:
@@ -250,23 +252,72 @@ class Changeover:
     def close(self) -> None:
         """Shut down every module that is being started."""
         self._drop_trial()
-        self._end_attempt()
+        self._end_attempts()
 
-    def _end_attempt(self) -> None:
-        if self._attempt is not None:
-            self._attempt.runner.retire()
-            self._attempt = None
+    def _end_attempts(self) -> None:
+        for attempt in self._attempts:
+            attempt.runner.retire()
+        self._attempts = []
+
+    def _leave_others(self) -> None:
+        """End the attempts that another was quicker than; the first choice starts on standby."""
+        first = next(filter(self._is_first_choice, self._attempts), None)
+        if first is not None and first.handover is None and self._trial is None:
+            first.is_trial, self._trial = True, first
+            self._attempts.remove(first)
+        self._end_attempts()
+
+    def _is_first_choice(self, attempt: _Attempt) -> bool:
+        first = self._candidates.of(self._candidates.scene)[:1]
+        return first == (attempt.runner.key,)
+
+    def _is_late(self) -> bool:
+        """Tell whether the newest candidate has left the robot lost for too long while it starts.
+
+        Then another may take over sooner. The paper's (cold) hand-over waits.
+        """
+        last, hold = self._attempts[-1], self._estimator.session.hold
+        is_waited_for = self.is_first or self._policy.handover == "cold"
+        if is_waited_for or last.handover is not None or hold.unheld_since_ns is None:
+            return False
+        lost_ns = self._estimator.now_ns - max(hold.unheld_since_ns, last.since_ns)
+        return bool(self._inactive()) and lost_ns >= hold.patience_ns
+
+    def _inactive(self) -> list[str]:
+        """Return the candidates that wait, but for the active module."""
+        return [key for key in self.queue if self._runners[key] is not self._estimator.active]
+
+    def _start_next(self) -> bool:
+        """Begin to start the next candidate; return whether there is one but the active module."""
+        if self._attempts:
+            self.queue = self._inactive()
+        runner, from_ns = self._runners[self.queue.pop(0)], None
+        if runner is self._estimator.active:
+            from_ns = self._estimator.session.hold.adrift_since_ns
+            is_adrift = self._verdict.reason == Health.LOST and from_ns is not None
+            if not runner.is_failed and not is_adrift:
+                return False  # it stays, as the fallback
+            self._estimator.retire()  # before it is started again
+        attempt = self._start(runner)
+        attempt.from_ns = from_ns
+        self._attempts.append(attempt)
+        return True
 
     def _start(self, runner: Runner) -> _Attempt:
         """Begin to start a module, which may take seconds."""
         self._candidates.use(runner.key)
         if self._trial is not None and self._trial.runner is runner:
             attempt, self._trial = self._trial, None
+            attempt.since_ns, attempt.is_trial = self._estimator.now_ns, bool(attempt.handover)
             return attempt
-        ready_ns = self._ready_ns(runner.key)
-        if self._policy.handover == "cold" and ready_ns > self._estimator.now_ns:
+        attempt = self._new_attempt(runner)
+        if self._policy.handover == "cold" and attempt.ready_ns > self._estimator.now_ns:
             self._estimator.retire()  # the paper shuts a module down before it starts the next
-        return _Attempt(runner=runner, ready_ns=ready_ns)
+        return attempt
+
+    def _new_attempt(self, runner: Runner, *, is_trial: bool = False) -> _Attempt:
+        now_ns, ready_ns = self._estimator.now_ns, self._ready_ns(runner.key)
+        return _Attempt(runner=runner, since_ns=now_ns, ready_ns=ready_ns, is_trial=is_trial)
 
     def _lead(self, attempt: _Attempt) -> bool | None:
         """Advance one candidate; return whether it took over, None while undecided."""
@@ -313,7 +364,8 @@ class Changeover:
 
     def _can_refuse(self) -> bool:
         """Tell whether there is an alternative to a lost module; the paper has no such check."""
-        has_other = bool(self.queue) or self._estimator.session.hold.is_held
+        others = bool(self.queue) or len(self._attempts) > 1
+        has_other = others or self._estimator.session.hold.is_held
         return has_other and self._policy.handover != "cold"
 
     def _refuse(self, runner: Runner, why: str) -> bool:
