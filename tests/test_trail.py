@@ -67,3 +67,13 @@ def test_stamps_that_jitter_and_noisy_poses_are_no_jumps():
         forward_m_s.append(trail.twist_s[0])
     np.testing.assert_allclose(forward_m_s[1:], 10.0, atol=1.5)
     np.testing.assert_allclose(trail.base_at((19900 - 800) * MS)[0, 3], -8.0, atol=0.2)
+
+
+@pytest.mark.parametrize("hz", [5, 10])
+def test_a_velocity_that_changed_at_once_is_the_new_one(hz):
+    """After a pose that was bridged as standing, a car drives on at 12 m/s."""
+    trail = Trail()
+    for index in range(6):
+        x_m = 12.0 / hz * index if index > 1 else 0.0
+        trail.add(1000 // hz * index * MS, se3.from_xy_yaw(x_m, 0.0, 0.0))
+    np.testing.assert_allclose(trail.twist_s, [12.0, 0.0, 0.0, 0.0, 0.0, 0.0], atol=1e-9)

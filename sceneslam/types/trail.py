@@ -24,20 +24,24 @@ class Trail:
 
     _stamps_ns: list[int] = field(default_factory=list)
     _poses: list[Transform] = field(default_factory=list)
+    _has_jumped: bool = False  # at the newest pose, so that the velocity is of before
 
     def add(self, stamp_ns: int, T_w_base: Transform) -> None:
         """Go on to a pose (4, 4) [m]; what is known of its stamp or later is replaced.
 
-        Where a loop or a hand-over moved the pose, it moves the way to it as well.
+        Where a loop or a hand-over moved the pose, it moves the way to it as well. No jump follows
+        another: what still moves otherwise than expected has another velocity.
         """
         self._keep(slice(self._count_before(stamp_ns - _KEPT_NS), self._count_before(stamp_ns)))
-        if len(self._poses) > 1:
+        is_compared, self._has_jumped = len(self._poses) > 1 and not self._has_jumped, False
+        if is_compared:
             step_s = (stamp_ns - self._stamps_ns[-1]) * 1e-9
             T_w_expected = self._poses[-1] @ se3.exp(step_s * self.twist_s)
             off = se3.log(se3.inverse(T_w_expected) @ T_w_base).reshape(2, 3)
             if (np.linalg.norm(off, axis=1) > _JUMP + step_s * UNKNOWN_VELOCITY).any():
                 T_moved = T_w_base @ se3.inverse(T_w_expected)
                 self._poses = [T_moved @ pose for pose in self._poses]
+                self._has_jumped = True
         self._append(stamp_ns, T_w_base)
 
     def move(self, stamp_ns: int, T_prev_base: Transform) -> None:
