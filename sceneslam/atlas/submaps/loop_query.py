@@ -96,16 +96,18 @@ class LoopQuery:
     def on_plane(self, first: int, T_first_second: Planar) -> Transform:
         """Return the motion (4, 4) from an earlier submap, of which the part in the plane is given.
 
-        On a floor height and tilt do not change; by hand they do as the motions alone say.
+        Height and tilt are as the motions alone say; on a floor they do not change.
         """
-        if self.floor_normal is not None:
-            T_level_base = mount(self.floor_normal)
-            T_base_level = se3.inverse(T_level_base)
-            return np.asarray(T_base_level @ planar.to_transform(T_first_second) @ T_level_base)
         lies, found = self.plane[self.second], planar.compose(self.plane[first], T_first_second)
         T_found_lies = planar.to_transform(found) @ se3.inverse(planar.to_transform(lies))
         T_run_second = T_found_lies @ self.T_run_node[self.second]
-        return np.asarray(se3.inverse(self.T_run_node[first]) @ T_run_second)
+        T_base_second = np.asarray(se3.inverse(self.T_run_node[first]) @ T_run_second)
+        if self.floor_normal is None:
+            return T_base_second
+        T_level_base = mount(self.floor_normal)
+        T_base_level = se3.inverse(T_level_base)
+        flat = planar.from_transform(T_level_base @ T_base_second @ T_base_level)
+        return np.asarray(T_base_level @ planar.to_transform(flat) @ T_level_base)
 
     @property
     def T_level_second(self) -> Transform:
