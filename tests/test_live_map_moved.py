@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 from test_one_map import atlas, world
 
+from sceneslam.atlas.atlas import Atlas
 from sceneslam.atlas.lasting.map_files import load_map_files
 from sceneslam.atlas.places.floor_plan import grid_of
+from sceneslam.atlas.submaps.correction import Correction
 from sceneslam.experiments.one_map.drive import RIG, Drive, Odometry
 from sceneslam.modules.maps import live_map
 from sceneslam.modules.maps.live_map import GridAndPoints
@@ -19,6 +21,8 @@ from sceneslam.types.grid_frames import resampled
 from sceneslam.types.maps import GridLayer, MovedMap
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Camera, Rig, Sensor
+
+S = 1_000_000_000
 
 
 class Shown:
@@ -122,6 +126,98 @@ def test_points_move_with_the_poses_that_they_were_seen_from():
     expected = before + np.where(is_second, 6.0, 0.0)[:, None] * [0.0, 1.0, 0.0]
     order, due = np.lexsort(after.T), np.lexsort(expected.T)
     np.testing.assert_allclose(after[order], expected[due], atol=1e-5)
+
+
+def test_points_that_loops_move_together_are_one():
+    """It drives along a wall again and again; each time, a loop takes the drift out."""
+    mapper = GridAndPoints(resolution_m=0.05, voxel_m=0.05, depth_stride_px=4)
+    camera = Camera(fx=70.0, fy=70.0, cx=39.5, cy=29.5, size_wh=(80, 60))
+    mapper.open(Rig(sensors=frozenset({Sensor.DEPTH}), camera=camera))
+    counts, depth_m = [], np.full((60, 80), 2.0, np.float32)
+    for lap in range(4):
+        for index in range(20):
+            pose = se3.from_xy_yaw(0.2 * index, 0.015 * index if lap else 0.0, np.pi / 2)
+            seen = Observation(stamp_ns=100 * lap + index, depth_m=depth_m)
+            mapper.add(seen, pose, pose)
+
+        def moved(stamps_ns, T_map_base, lap=lap):
+            T_new_base = T_map_base.copy()
+            T_new_base[stamps_ns >= 100 * lap, 1, 3] = 0.0
+            return T_new_base
+
+        mapper.move(MovedMap(loaded=None, moved=moved))
+        counts.append(len(mapper.map().points.points))
+    assert max(counts) < 1.4 * counts[0] and len(mapper._poses) <= 2 * 20
+
+
+class Placed:
+    """What of a run's map counts here: whether the robot was found in the loaded one."""
+
+    is_placed = False
+
+    def rewind(self, stamp_ns):
+        pass
+
+    def loaded_grid(self):
+        return None
+
+    def close(self):
+        pass
+
+
+class Drawn:
+    """An atlas, and its poses as a sink has them; it drives along x, 1 m per second."""
+
+    def __init__(self):
+        self.atlas, self.mapper, self.poses = Atlas(voxel_m=0.05), Placed(), {}
+        self.atlas._mapper = self.mapper
+        self.atlas.begin_session("only", se3.identity())
+
+    def go(self, *seconds):
+        for at in seconds:
+            self.atlas.add(at * S, se3.from_xy_yaw(at, 0.0, 0.0), "only")
+            moved = self.atlas.take_moved()
+            for key in self.poses if moved is not None else ():
+                (self.poses[key],) = moved.moved(np.array([key * S]), self.poses[key][None])
+            self.poses[at] = self.atlas.pose_at(at * S)
+        return self
+
+    def correct(self, nodes):
+        stamps_ns = np.array(list(nodes)) * S
+        T_new_old = np.array([se3.from_xy_yaw(*moved, 0.0) for moved in nodes.values()])
+        self.atlas.correct(Correction(stamps_ns=stamps_ns, T_new_old=T_new_old))
+
+
+def test_what_is_drawn_after_a_rewind_is_moved_from_where_it_is():
+    drawn = Drawn().go(*range(21))
+    drawn.correct({0: (0.0, 0.0), 15: (0.0, 0.0), 20: (0.0, 1.0)})
+    drawn.go(21).atlas.rewind(17 * S, se3.identity())
+    drawn.go(*range(17, 30)).correct({20: (0.0, 0.0), 25: (0.0, 0.0), 29: (0.0, 0.06)})
+    drawn.go(30)
+    np.testing.assert_allclose(drawn.poses[25][:2, 3], [25.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(drawn.poses[30][:2, 3], [30.0, 0.06], atol=1e-9)
+
+
+@pytest.mark.parametrize("is_placed", [True, False])
+def test_what_is_drawn_follows_a_run_that_goes_on_without_its_map(is_placed):
+    drawn = Drawn().go(*range(10))
+    drawn.mapper.is_placed = is_placed
+    drawn.correct({0: (10.0, 5.0)})
+    drawn.go(10).atlas._give_up(RuntimeError("no space left"))
+    drawn.go(11)
+    for at in (5, 10, 11):
+        np.testing.assert_allclose(drawn.poses[at][:2, 3], [at, 0.0], atol=1e-9)
+
+
+def test_what_is_moved_to_and_fro_stays_where_it_was():
+    turned = [se3.from_xy_yaw(0.0, 0.0, 0.02 * node) for node in range(10)]
+    stamps_ns, at_ns = np.arange(10) * S, np.arange(9) * S + S // 2
+    one = Correction(stamps_ns=stamps_ns, T_new_old=np.array(turned))
+    other = Correction(stamps_ns=stamps_ns, T_new_old=se3.from_xy_yaw(0.0, 0.06, 0.0) @ turned)
+    poses = before = np.tile(se3.from_xy_yaw(60.0, 60.0, 0.0), (9, 1, 1))
+    for _ in range(50):
+        poses = one.moved(other, at_ns, other.moved(one, at_ns, poses))
+    np.testing.assert_allclose(poses, before, atol=1e-9)
 
 
 @pytest.mark.parametrize("cell_m", [0.05, 0.02, 0.1, 0.2])

@@ -74,13 +74,16 @@ class GridAndPoints:
         before = np.array(self._poses)
         after = moved.moved(np.array(self._stamps_ns, np.int64), before)
         T_new_old = (after @ inverse(before)).astype(np.float32)
-        self._poses = list(after)
         for start in range(0, len(self._points), _BLOCK):
             block = slice(start, start + _BLOCK)
             T = T_new_old[self._owners[block]]
             turned = np.einsum("nij,nj->ni", T[:, :3, :3], self._points[block])
             self._points[block] = turned + T[:, :3, 3]
-        self._keys = np.unique(self._keys_of(self._points))
+        self._keys, kept = np.unique(self._keys_of(self._points), return_index=True)
+        self._points, self._colors = self._points[kept], self._colors[kept]
+        seen, owners = np.unique(self._owners[kept], return_inverse=True)
+        self._owners = owners.astype(np.int32)
+        self._poses, self._stamps_ns = list(after[seen]), [self._stamps_ns[row] for row in seen]
 
     def map(self) -> HybridMap:
         """Return a copy of the map."""
@@ -131,24 +134,24 @@ class GridAndPoints:
         colors = np.full((len(points), 3), _UNSEEN_BGR, np.uint8)
         if observation.image_bgr is not None:
             colors = observation.image_bgr[rows, columns]
-        owners = np.full(len(points), len(self._poses), np.int32)
-        self._stamps_ns.append(observation.stamp_ns)
-        self._poses.append(T_map_base)
-        self._add_points(points, colors, owners)
+        if self._add_points(points, colors, owner=len(self._poses)):
+            self._stamps_ns.append(observation.stamp_ns)
+            self._poses.append(T_map_base)
 
     def _add_points(
-        self,
-        points: NDArray[np.float32],
-        colors: NDArray[np.uint8],
-        owners: NDArray[np.int32],
-    ) -> None:
-        """Add the points (N, 3) [m], map, of empty voxels, with colours (N, 3) and owners (N,)."""
+        self, points: NDArray[np.float32], colors: NDArray[np.uint8], *, owner: int
+    ) -> bool:
+        """Add the points (N, 3) [m], map, of empty voxels; return whether there are any.
+
+        `colors` (N, 3) are theirs, `owner` the image that they are from.
+        """
         keys, first = np.unique(self._keys_of(points), return_index=True)
         is_new = ~np.isin(keys, self._keys, assume_unique=True)
         self._keys = np.union1d(self._keys, keys[is_new])
         self._points = np.concatenate([self._points, points[first[is_new]]])
         self._colors = np.concatenate([self._colors, colors[first[is_new]]])
-        self._owners = np.concatenate([self._owners, owners[first[is_new]]])
+        self._owners = np.append(self._owners, np.full(is_new.sum(), owner, np.int32))
+        return bool(is_new.any())
 
     def _keys_of(self, points: NDArray[np.float32]) -> NDArray[np.int64]:
         """Return the voxels (N,) of points (N, 3) [m]."""

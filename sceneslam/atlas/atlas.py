@@ -6,6 +6,7 @@ import logging
 from bisect import bisect_right
 from collections.abc import Collection, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -230,6 +231,7 @@ class Atlas:
             self._journal.add_rewind(stamp_ns, T_new_told)
         self._path.cut(stamp_ns, T_new_told)
         self._correction = self._correction.cut(stamp_ns)
+        self._shown = self._shown.cut(stamp_ns)
         if self._mapper is not None:
             try:
                 self._mapper.rewind(stamp_ns)
@@ -258,29 +260,25 @@ class Atlas:
 
     def take_moved(self) -> MovedMap | None:
         """Return the map if loops or a loaded map have moved it visibly since the last call."""
-        mapper, was, now = self._mapper, self._shown, self._correction
-        path = self._path
-        if mapper is None or now is self._compared or not path.stamps_ns:
+        was, now, path = self._shown, self._correction, self._path
+        if now is self._compared or not path.stamps_ns:
             return None
         self._compared = now
-        rows = np.searchsorted(path.stamps_ns[:-1], now.stamps_ns)
+        nodes_ns = np.union1d(was.stamps_ns, now.stamps_ns)
+        rows = np.searchsorted(path.stamps_ns[:-1], nodes_ns)
         T_run_base = np.reshape([path.poses[row] for row in rows], (-1, 4, 4))
-        T_was_base, T_now_base = (one.apply(now.stamps_ns, T_run_base) for one in (was, now))
+        T_was_base, T_now_base = (one.apply(nodes_ns, T_run_base) for one in (was, now))
         off = se3.inverse(T_was_base) @ T_now_base
         is_seen = np.linalg.norm(off[:, :3, 3], axis=1) > _SEEN_M
         is_seen |= se3.rotation_angle_rad(off) > _SEEN_RAD
-        if not is_seen.any() and mapper.is_placed == self._shows_loaded:
+        loaded = None
+        if self._mapper is not None and self._mapper.is_placed:
+            loaded = self._mapper.loaded_grid
+        is_loaded = loaded is not None
+        if not is_seen.any() and is_loaded == self._shows_loaded:
             return None
-        self._shown, self._shows_loaded = now, mapper.is_placed
-
-        def moved(
-            stamps_ns: NDArray[np.int64], T_map_base: NDArray[np.float64]
-        ) -> NDArray[np.float64]:
-            T_was_run = was.apply(stamps_ns, np.tile(se3.identity(), (len(stamps_ns), 1, 1)))
-            return now.apply(stamps_ns, se3.inverse(T_was_run) @ T_map_base)
-
-        loaded = mapper.loaded_grid if mapper.is_placed else None
-        return MovedMap(loaded=loaded, moved=moved)
+        self._shown, self._shows_loaded = now, is_loaded
+        return MovedMap(loaded=loaded, moved=partial(now.moved, was))
 
     @property
     def last_covariance(self) -> Covariance | None:

@@ -68,3 +68,14 @@ class Correction:
         shares = np.clip((stamps_ns - self.stamps_ns[before]) / span_ns, 0.0, 1.0)
         first, second = (self.T_new_old[nodes] @ T_map_base for nodes in (before, after))
         return se3.interpolate(first, second, shares)
+
+    def moved(
+        self, was: Correction, stamps_ns: NDArray[np.int64], T_map_base: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return poses (M, 4, 4) that `was` corrected, as this one does.
+
+        It may be moved any number of times: what one correction adds the next takes away.
+        """
+        still = np.tile(se3.identity(), (len(stamps_ns), 1, 1))
+        T_now_run, T_was_run = (one.apply(stamps_ns, still) for one in (self, was))
+        return np.asarray(T_now_run @ se3.inverse(T_was_run) @ T_map_base)
