@@ -126,8 +126,7 @@ class RunLoop:
         """
         if self._is_stepping and not self._bus.leave_awaited(self._last_ns()):
             raise KeyboardInterrupt
-        if self._bus.state == "terminate":
-            self.faults.append(self._why_over())
+        self.faults += self._without_module()
         self._operator.close(self._last_ns())
         self._bus.close(self._last_ns())
         self.faults += self._parts.atlas.finish()
@@ -330,9 +329,12 @@ class RunLoop:
     def _last_ns(self) -> int:
         return self._observed_ns[-1] if self._observed_ns else 0
 
-    def _why_over(self) -> str:
-        whats: Sequence[str] = [e["what"] for e in self._log.events if e["event"] == "fault"]
-        return f"no module is left for scene {self._bus.scene or '(none)'}: {whats[-1]}"
+    def _without_module(self) -> list[str]:
+        """Return for which scenes no module was left, and why: the run ended or was bridged."""
+        scenes = dict(self._bus.unserved)
+        if self._bus.state == "terminate":
+            scenes[self._bus.scene or "(none)"] = self._log.last_fault
+        return [f"no module is left for scene {scene}: {what}" for scene, what in scenes.items()]
 
     def _why_no_pose(self) -> str:
         if not self._observed_ns:

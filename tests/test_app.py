@@ -110,6 +110,15 @@ def test_run_without_a_module_left_says_so_and_is_saved(tmp_path):
     assert len(Trajectory.read_tum(tmp_path / "trajectory.tum")) >= 10
 
 
+def test_run_with_a_scene_whose_module_failed_says_so_and_goes_on(tmp_path):
+    broken = {"_target_": "fakes.ExactModule", "raises": [10]}
+    scenes = {"Bright": ["bright"], "Dark": ["dark"]}
+    finished = run(config(slam__bright=broken, scenes=scenes), tmp_path)
+    (fault,) = finished.faults
+    assert fault.startswith("no module is left for scene Bright: slam.bright failed")
+    assert "dark" in (tmp_path / "events.jsonl").read_text()
+
+
 def test_damage_that_the_source_reports_is_passed_on(tmp_path):
     finished = run(config(source__fault="3 % of the file could not be read"), tmp_path)
     assert finished.faults == ("3 % of the file could not be read",)

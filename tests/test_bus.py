@@ -161,6 +161,22 @@ def test_run_terminates_when_no_module_is_left():
     assert len(atlas.trajectory) == 51  # the last one bridged
 
 
+@pytest.mark.parametrize("has_odometry", [True, False])
+@pytest.mark.parametrize("fault", [{"raises": {20}}, {"raises_on_activate": True}])
+def test_a_scene_without_a_module_left_is_bridged_until_another_scene_has_one(fault, has_odometry):
+    bus, atlas, log, _ = drive(
+        {"bright": ExactModule(**fault), "dark": ExactModule()},
+        table={"Bright": ["bright"], "Dark": ["dark"]},
+        scene_at=dark_from(50),
+        has_odometry=has_odometry,
+    )
+    assert events(log, "decision")[-1]["to"] == "dark" and atlas.pose_modules[-1] == "dark"
+    assert list(bus.unserved) == ["Bright"] and "slam.bright" in bus.unserved["Bright"]
+    states = [event["to"] for event in events(log, "state")]
+    assert len(states) < 12 and states.count("terminate") == 1
+    assert not has_odometry or "raises_on_activate" in fault or len(atlas.trajectory) == 100
+
+
 def test_detector_that_raises_keeps_the_scene():
     def scene_at(index):
         if index == 30:

@@ -112,6 +112,7 @@ class Bus:
         )
         self._situation: Situation | None = None  # at the last decision
         self._odom_ns: int | None = None  # stamp of the last odometry
+        self.unserved: dict[str, str] = {}  # scenes whose modules all failed, and the last fault
         self._do: _Step  # what the state does with an observation
         self._go_on: _Step  # the same for the observation at which the state was entered
         self._machine = BusMachine(self)
@@ -187,8 +188,8 @@ class Bus:
         return bool(self._changeover.queue)
 
     def fallback_active(self) -> bool:
-        """Tell whether a module other than the first choice runs, or will run again."""
-        return self._estimator.active is not None or bool(self._candidates.returning(self.scene))
+        """Tell whether a module other than the first choice runs, or one may run later."""
+        return self._estimator.active is not None or self._candidates.may_return
 
     # Actions on entering a state.
 
@@ -202,6 +203,8 @@ class Bus:
 
     def on_enter_run(self) -> None:
         """Track, until the scene calls for another module or the active one is unhealthy."""
+        if self._estimator.active is None and not self._candidates.returning(self.scene):
+            self.unserved.setdefault(self.scene, self._log.last_fault)
         self._do, self._go_on = self._decide, _wait
 
     def on_enter_switch(self) -> None:
@@ -289,7 +292,7 @@ class Bus:
             rounds=self._candidates.rounds,
             trial=self._changeover.trial,
             retry_ns=self._candidates.retry_ns,
-            may_return=bool(self._candidates.returning(self.scene)),
+            may_return=self._candidates.may_return,
             adrift_since_ns=hold.adrift_since_ns,
         )
 

@@ -59,6 +59,11 @@ class Candidates:
         """Return the modules of a scene that can run, now or later."""
         return tuple(key for key in self._scenes.get(scene, ()) if self._runners[key].may_return)
 
+    @property
+    def may_return(self) -> bool:
+        """Tell whether any scene has a module that can run, now or later."""
+        return any(self.returning(scene) for scene in self._scenes)
+
     def serve(self, scene: str, keys: Sequence[str], rounds: int) -> None:
         """Set the served scene; of its modules only `keys` may be tried."""
         if scene != self.scene:

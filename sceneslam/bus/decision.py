@@ -41,7 +41,7 @@ class Situation:
     rounds: int  # how often all choices were tried and failed
     trial: StandbyTrial
     retry_ns: int  # when the first choice may be tried again
-    may_return: bool  # a failed module will return: the run may go on without any
+    may_return: bool  # any scene's module may run later: the run may go on without one
     adrift_since_ns: int | None = None  # since when the active one is lost where it could begin
 
 

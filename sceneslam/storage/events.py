@@ -34,6 +34,7 @@ class EventLog:
         self._newest: list[Event] = []  # those after them
         self._written = 0  # how many of the newest are in the file
         self._file = LogFile(path, make_room) if path else None
+        self.last_fault = ""
 
     @property
     def fault(self) -> str:
@@ -57,6 +58,8 @@ class EventLog:
         for key, value in fields.items():
             line[key] = None if isinstance(value, float) and not math.isfinite(value) else value
         self._newest.append(line)
+        if event == "fault":
+            self.last_fault = str(fields["what"])
         if event != "vote":
             self.flush()
 
