@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
 
+from sceneslam.config.files import check_names
 from sceneslam.types.errors import ConfigError
 
 GROUPS = {  # group -> description
@@ -30,7 +31,8 @@ _ALIASES = {f"{group}s": group for group in GROUPS} | {"modules": "slam", "modul
 def listing(words: Sequence[str]) -> list[str]:
     """Return the lines of `python -m sceneslam list [GROUP ...] [--config-dir FOLDER]`.
 
-    Raises ConfigError for an unknown group or a missing folder.
+    Raises ConfigError for an unknown group, a missing folder, or an option in it with the name of
+    one of ours.
     """
     parser = argparse.ArgumentParser(
         prog="python -m sceneslam list", description="List what there is to choose."
@@ -42,6 +44,7 @@ def listing(words: Sequence[str]) -> list[str]:
     if asked.config_dir is not None:
         if not asked.config_dir.is_dir():
             raise ConfigError("--config-dir", str(asked.config_dir), "a folder that exists")
+        check_names(asked.config_dir)
         folders.append(asked.config_dir)
     lines: list[str] = []
     for name in asked.groups or GROUPS:
@@ -53,7 +56,7 @@ def listing(words: Sequence[str]) -> list[str]:
 
 
 def _options(group: str, folders: Sequence[Path]) -> list[str]:
-    """Return a line for each option of a group; later folders override earlier ones."""
+    """Return a line for each option of a group in any of the folders."""
     files = {
         path.relative_to(folder / group).with_suffix("").as_posix(): path
         for folder in folders

@@ -12,6 +12,7 @@ from hydra.errors import HydraException, OverrideParseException
 
 from sceneslam import app
 from sceneslam.config.check import check_no_reference, first_line
+from sceneslam.config.files import check_names
 from sceneslam.config.resolve import resolved
 from sceneslam.config.words import check_trust, how_to_quote, quoted, readable
 from sceneslam.storage.folder import RunFolder, give_back
@@ -55,6 +56,7 @@ def composed(overrides: tuple[str, ...], config_dir: str | Path | None) -> dict[
         path = Path(config_dir).resolve()
         if not path.is_dir():
             raise ConfigError("config_dir", str(config_dir), "a folder that exists")
+        check_names(path)
         words.append(f"hydra.searchpath=[{quoted(f'file://{path}')}]")
     GlobalHydra.instance().clear()  # a notebook may have initialised it before
     try:

@@ -33,6 +33,13 @@ def test_options_of_ones_own_are_listed(tmp_path):
     assert any(line.split() == ["barn", "Hay"] for line in lines)
 
 
+def test_option_of_ones_own_with_the_name_of_one_of_ours_is_refused(tmp_path):
+    (tmp_path / "slam").mkdir()
+    (tmp_path / "slam" / "laser.yaml").write_text("# A laser of mine.\n")
+    with pytest.raises(ConfigError, match=r"^slam: got .*slam/laser.yaml', allowed: another name"):
+        listing(["--config-dir", str(tmp_path)])
+
+
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [

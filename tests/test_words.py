@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -67,6 +68,55 @@ def test_a_script_gives_paths_as_the_command_line_does(tmp_path, path):
     (own / "mine.yaml").write_text("defaults: [default]\nretry_s: 7.0\n")
     config = composed(("source=rosbag", f"source.path={path}", "policy=mine"), own.parent)
     assert config["source"]["path"] == path and config["policy"]["retry_s"] == 7.0
+
+
+def own(folder, option, base="/slam/laser"):
+    """Write an option of a user, a laser of 3 m, and return its file."""
+    path = folder / f"{option}.yaml"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(f"defaults: [{base}@_here_, _self_]\nrange_max_m: 3.0\n")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("option", "told"),
+    [
+        ("slam/laser", "slam: got '{}', allowed: another name, as ours is read for laser"),
+        ("policy/default", "policy: got '{}', allowed: another name, as ours is read for default"),
+        (
+            "slam/ros2/rtabmap",
+            "slam: got '{}', allowed: another name, as ours is read for ros2/rtab",
+        ),
+    ],
+)
+def test_option_with_the_name_of_one_of_ours_is_refused(tmp_path, option, told):
+    path = own(tmp_path, option)
+    with pytest.raises(ConfigError) as caught:
+        composed(("+scenario=single",), tmp_path)
+    assert str(caught.value).startswith(told.format(path))
+    assert f"`defaults: [/{option}@_here_]` bases yours on it" in str(caught.value)
+
+
+@pytest.mark.parametrize("words", [["--config-dir", "mine"], ["hydra.searchpath=[file://mine]"]])
+def test_command_line_refuses_an_option_with_the_name_of_one_of_ours(folder, words):
+    own(folder / "mine", "slam/laser")
+    done = call(folder, *words, *SINGLE, "hydra.run.dir=out")
+    assert done.returncode == 2 and done.stderr.startswith("error: slam: got ")
+    assert "mine/slam/laser.yaml" in done.stderr and done.stderr.count("\n") == 1
+    assert not (folder / "out").exists()
+
+
+@pytest.mark.parametrize("option", ["slam/mine", "slam/ros2/mine", "slam/mine/laser"])
+def test_option_of_another_name_is_read(tmp_path, option):
+    own(tmp_path, option)
+    words = ("+scenario=single", f"slam@slam.only={option.removeprefix('slam/')}")
+    assert composed(words, tmp_path)["slam"]["only"]["range_max_m"] == 3.0
+
+
+def test_our_own_folder_and_a_copy_of_it_are_read(tmp_path):
+    shutil.copytree(ROOT / "conf", tmp_path / "conf")
+    for folder in (ROOT / "conf", tmp_path / "conf"):
+        assert composed(("+scenario=single",), folder)["slam"]
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,9 @@
-"""Reading of users' YAML files, with limits on their size."""
+"""Reading of users' YAML files, with limits on their names and size."""
 
 from __future__ import annotations
 
+import filecmp
+from importlib import resources
 from pathlib import Path
 
 import yaml
@@ -10,7 +12,7 @@ from hydra._internal.sources_registry import SourcesRegistry
 from hydra.core.plugins import Plugins
 from hydra.plugins.config_source import ConfigResult
 
-from sceneslam.types.errors import InputError
+from sceneslam.types.errors import ConfigError, InputError
 
 _MOST_BYTES = 1 << 20
 _MOST_VALUES = 20_000  # with expanded aliases; our largest file has a hundred
@@ -18,7 +20,11 @@ _DEEPEST = 32
 
 
 class CheckedFiles(FileConfigSource):
-    """Hydra's reader of `--config-dir` and `hydra.searchpath`, with limits on file size."""
+    """Hydra's reader of `--config-dir` and `hydra.searchpath`, with limits on names and size."""
+
+    def __init__(self, provider: str, path: str) -> None:
+        super().__init__(provider, path)
+        check_names(Path(self.path))
 
     def load_config(self, config_path: str) -> ConfigResult:
         """Return a file's contents; raises InputError if it is too large."""
@@ -32,6 +38,21 @@ def register() -> None:
     """Register this class as Hydra's file reader."""
     Plugins.instance()  # registers Hydra's own reader first
     SourcesRegistry.instance().types[CheckedFiles.scheme()] = CheckedFiles
+
+
+def check_names(folder: Path) -> None:
+    """Raise ConfigError for an option in a folder that differs from ours of the same name.
+
+    Hydra reads the first file of a name that it finds, which is ours.
+    """
+    conf = Path(str(resources.files("sceneslam.conf")))
+    for ours in sorted(conf.glob("*/**/*.yaml")):
+        theirs = Path(folder, ours.relative_to(conf))
+        if theirs.is_file() and not filecmp.cmp(ours, theirs, shallow=False):
+            group, _, name = ours.relative_to(conf).with_suffix("").as_posix().partition("/")
+            base = f"`defaults: [/{group}/{name}@_here_]` bases yours on it"
+            allowed = f"another name, as ours is read for {name} ({base})"
+            raise ConfigError(group, str(theirs), allowed)
 
 
 def check_yaml(path: Path) -> None:
