@@ -55,6 +55,7 @@ class Robot:
         self.mounts = {names.LASER: T_BASE_LASER, names.CAMERA: se3.identity()}
         self.root_mounts, self.root_is_latched = None, True
         self.tf_frame, self.tf_ahead_m = names.ODOM, 0.0
+        self.inertial = {Sensor.GYRO: np.array([0.0, 0.0, 0.5])}
         self._topics = {topic: TYPES[topic] for topic in topics}
         for topic in topics:  # what serialises a type is made at its first message
             self._message(self.encoder, topic, 0)
@@ -104,7 +105,7 @@ class Robot:
             T_odom_base = se3.from_xy_yaw(x_m + self.tf_ahead_m, 0.0, 0.0)
             return encoder.transforms(stamp_ns, self.tf_frame, {names.BASE: T_odom_base})
         if topic == "/imu":
-            return encoder.imu(stamp_ns, {Sensor.GYRO: np.array([0.0, 0.0, 0.5])})
+            return encoder.imu(stamp_ns, self.inertial)
         if topic.endswith("/scan"):
             return encoder.scan(stamp_ns, scan(stamp_ns))
         if topic == INFO:
@@ -182,6 +183,15 @@ def test_rig_is_what_is_heard(make):
     }  # fmt: skip
     assert rig.camera.size_wh == (8, 6)
     np.testing.assert_allclose(rig.laser.T_base_laser, T_BASE_LASER)
+
+
+@pytest.mark.parametrize("force_mps2", [0.0, 9.81])
+def test_imu_that_is_zero_while_the_robot_stands_is_in_the_rig(make, force_mps2):
+    """Of a simulated robot, it may turn later."""
+    robot = Robot("/scan", "/imu")
+    inertial = {Sensor.GYRO: np.zeros(3), Sensor.ACCELEROMETER: np.array([0.0, 0.0, force_mps2])}
+    robot.inertial = inertial
+    assert heard(make(robot), robot).sensors == {Sensor.SCAN, *inertial}
 
 
 def test_many_messages_are_kept_of_topics_with_samples_alone(make):

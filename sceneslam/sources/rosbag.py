@@ -86,7 +86,13 @@ class RosBag:
             self._by_sensor = sensor_topics(self._recording, self._topics)
             self._primary = self._choose_primary()
             self._frames = FrameTree(self._recording, base_frame, self._by_sensor.values())
-            self._rig = make_rig(self._recording, self._topics, self._frames, given)
+            self._rig = make_rig(
+                self._recording,
+                self._topics,
+                sensors=self._by_sensor,
+                frames=self._frames,
+                given=given,
+            )
             self._mounts = find_mounts(self._recording, self._topics, self._frames)
         except InputError as err:
             raise InputError(f"{err}: {path}") from err

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -59,7 +59,14 @@ def sensor_topics(
     }
 
 
-def make_rig(recording: Recording, topics: BagTopics, frames: FrameTree, given: Given) -> Rig:
+def make_rig(
+    recording: Recording,
+    topics: BagTopics,
+    *,
+    sensors: Collection[Sensor],
+    frames: FrameTree,
+    given: Given,
+) -> Rig:
     """Return the rig; raises InputError for a camera that cannot be used, and says how to go on."""
     said = recording.metadata.get(names.RIG_METADATA, {})
     laser = lidar = None
@@ -77,8 +84,9 @@ def make_rig(recording: Recording, topics: BagTopics, frames: FrameTree, given: 
             camera = _camera(recording, topics, frames, given.intrinsics, depth_range_m)
         except InputError as err:
             raise InputError(f"{err}{_way_without_camera(topics)}") from err
-    sensors = frozenset(sensor_topics(recording, topics))
-    return Rig(sensors=sensors, camera=camera, laser=laser, lidar=lidar, wheels=given.wheels)
+    return Rig(
+        sensors=frozenset(sensors), camera=camera, laser=laser, lidar=lidar, wheels=given.wheels
+    )
 
 
 def place(

@@ -195,7 +195,13 @@ class Ros2(Measuring):
             if not any(sensor in self._by_sensor for sensor in PRIMARY):
                 raise InputError("no image, depth, points, scan or odometry")
             self.frames = FrameTree(heard, self._base_frame, self._by_sensor.values())
-            self._rig = make_rig(heard, self.topics, self.frames, self._given)
+            self._rig = make_rig(
+                heard,
+                self.topics,
+                sensors=self._by_sensor,
+                frames=self.frames,
+                given=self._given,
+            )
             self._mounts = find_mounts(heard, self.topics, self.frames)
         except InputError as error:
             raise InputError(f"{error}: {self._where()}, {self._there()}") from error
