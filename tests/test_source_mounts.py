@@ -324,6 +324,17 @@ def test_gyro_of_a_simulated_robot_may_be_zero_at_rest(
     assert inertial_sensors(open_recording(path), "/imu/sample", is_live=True) == both
 
 
+def test_imu_of_an_orientation_alone_measures_nothing(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Its vectors are zeros: as a gyro, it would say that a robot that turns does not turn."""
+    path = record_imus(tmp_path / "a.mcap", imu=[0.0] * 6)
+    assert make_source("mcap", path).rig.sensors == {Sensor.SCAN}
+    assert "/imu/sample holds no gyro, only zeros" in caplog.text
+    both = {Sensor.GYRO, Sensor.ACCELEROMETER}  # it may measure later
+    assert inertial_sensors(open_recording(path), "/imu/sample", is_live=True) == both
+
+
 def pose_truth(path: Path) -> Path:
     with Recorder(path) as recorder:
         recorder.image("/rgb", STAMP_NS, COLOR, "bgr8")

@@ -106,10 +106,10 @@ def inertial_sensors(
 ) -> Collection[Sensor]:
     """Return which of gyro and accelerometer an Imu topic measures, by samples of its messages.
 
-    A vector is missing if its covariance says so, or if it is exactly zero in all samples and the
-    other one is not: RealSense's driver publishes both apart. A simulated robot that stands still
-    measures no turn either, but may turn later: a gyro that is zero so far is taken to be one in a
-    live recording, unless the topic is named as an accelerometer.
+    A vector is missing if its covariance says so, or if it is exactly zero in all samples: a driver
+    may fill in the orientation alone, and RealSense's publishes both vectors apart. In a live
+    recording, a simulated robot that stands still may turn later: a gyro that is zero so far is
+    taken to be one, unless the topic is named as an accelerometer. So are both while both are zero.
     """
     said: set[Sensor] = set()
     moved: set[Sensor] = set()
@@ -120,7 +120,7 @@ def inertial_sensors(
         moved |= {sensor for sensor, vector in vectors.items() if vector.any()}
         if len(moved) == 2:
             break
-    silent = said - moved if moved else set()
+    silent = said - moved if moved or not is_live else set()
     if is_live and "accel" not in topic.lower():
         silent -= {Sensor.GYRO}
     for sensor in silent:
