@@ -335,6 +335,31 @@ def test_imu_of_an_orientation_alone_measures_nothing(
     assert inertial_sensors(open_recording(path), "/imu/sample", is_live=True) == both
 
 
+@pytest.mark.parametrize(
+    ("step_m", "speed_mps", "is_used"), [(0.0, 0.4, False), (0.04, 0.4, True), (0.0, 0.0, True)]
+)
+def test_odometry_whose_twist_alone_moves_is_not_used(
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    step_m: float,
+    speed_mps: float,
+    is_used: bool,
+) -> None:
+    """Its pose says that the robot stands: a laser that is right would be taken to be wrong."""
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        for number in range(150):
+            stamp_ns = STAMP_NS + number * 10**8
+            moved_m = step_m * max(0, number - 120)
+            message = odometry(recorder, stamp_ns, se3.from_xy_yaw(moved_m, 0.0, 0.0), "base_link")
+            message.twist.twist.linear.x = speed_mps
+            recorder.add("/odom", stamp_ns, message)
+            recorder.scan("/scan", stamp_ns, [1.0, 2.0])
+    rig = make_source("mcap", tmp_path / "a.mcap").rig
+    assert (Sensor.ODOMETRY in rig.sensors) == is_used
+    said = "/odom: its pose does not move although its twist does"
+    assert (said in caplog.text) != is_used
+
+
 def pose_truth(path: Path) -> Path:
     with Recorder(path) as recorder:
         recorder.image("/rgb", STAMP_NS, COLOR, "bgr8")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from math import hypot
 from typing import Any
 
 import cv2
@@ -157,6 +158,18 @@ def inertial(imu: Any) -> dict[Sensor, NDArray[np.float64]]:
         for sensor, (vector, covariance) in measured.items()
         if covariance[0] != -1  # -1: not measured
     }
+
+
+def pose_values(odometry: Any) -> tuple[float, ...]:
+    """Return an Odometry's position and quaternion as they are, x, y, z [m] and x, y, z, w."""
+    at, turn = odometry.pose.pose.position, odometry.pose.pose.orientation
+    return at.x, at.y, at.z, turn.x, turn.y, turn.z, turn.w
+
+
+def speed(odometry: Any) -> float:
+    """Return the greater of an Odometry's speed [m/s] and turn rate [rad/s], by its twist."""
+    twist = odometry.twist.twist
+    return max(hypot(one.x, one.y, one.z) for one in (twist.linear, twist.angular))
 
 
 def scan(message: Any, stamp_ns: int) -> LaserScan | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import re
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -14,13 +15,21 @@ from sceneslam.ros import decode, names, pixels
 from sceneslam.sources.bag.frames import FrameTree, has_base_name
 from sceneslam.sources.bag.observation import Mounts
 from sceneslam.sources.bag.recording import Recording
-from sceneslam.sources.bag.topics import NONE, BagTopics, first, inertial_sensors, infos_of
+from sceneslam.sources.bag.topics import (
+    NONE,
+    BagTopics,
+    first,
+    holds_poses,
+    inertial_sensors,
+    infos_of,
+)
 from sceneslam.sources.intrinsics import Intrinsics
 from sceneslam.types import se3
 from sceneslam.types.errors import InputError
 from sceneslam.types.rig import Camera, Laser, Lidar, Rig, Sensor, Wheels, optical_to_rep103
 from sceneslam.types.se3 import Transform
 
+_log = logging.getLogger(__name__)
 _NEEDS = {  # sensor -> field of BagTopics that names its topic
     Sensor.IMAGE: "image",
     Sensor.DEPTH: "depth",
@@ -51,6 +60,13 @@ def sensor_topics(
 ) -> dict[Sensor, str]:
     """Return the topic of each recorded sensor; one Imu topic can be gyro and accelerometer."""
     chosen = {sensor: getattr(topics, need) for sensor, need in _NEEDS.items()}
+    if topics.odometry and not is_live and not holds_poses(recording, topics.odometry):
+        _log.warning(
+            "%s: its pose does not move although its twist does; it is not used, as with "
+            "source.topics.odometry=none",
+            topics.odometry,
+        )
+        chosen[Sensor.ODOMETRY] = None
     measured = inertial_sensors(recording, topics.imu, is_live=is_live) if topics.imu else set()
     return {
         sensor: name

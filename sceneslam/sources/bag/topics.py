@@ -20,6 +20,7 @@ _log = logging.getLogger(__name__)
 NONE = "none"  # as a topic's name: the sensor is not used
 _FIRST_IMU = 100  # messages searched for both sensors, which may come in messages of their own
 _LATER_IMU = 20  # messages at each of so many times, where a vector of all of these is zero
+_SPEED_AT_REST = 0.05  # [m/s] or [rad/s]; more than the noise of odometry that stands still
 _HINTS = {"odometry": "; of a robot, the one that is odom -> base_link on /tf"}
 _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _POSES = (
@@ -126,6 +127,23 @@ def inertial_sensors(
     for sensor in silent:
         _log.warning("%s holds no %s, only zeros", topic, sensor.value)
     return said - silent
+
+
+def holds_poses(recording: Recording, topic: str) -> bool:
+    """Tell whether an Odometry topic reports where the robot is, by samples of its messages.
+
+    A driver may fill in the twist alone: the pose then stays where it is while the robot drives.
+    """
+    poses: set[tuple[float, ...]] = set()
+    speeds: list[float] = []
+    for message in _spread_messages(recording, topic):
+        odometry = recording.decode(message)
+        if odometry is not None:
+            poses.add(decode.pose_values(odometry))
+            speeds.append(decode.speed(odometry))
+        if len(poses) > 1:
+            return True
+    return len(speeds) < 2 or not np.percentile(speeds, 90) > _SPEED_AT_REST
 
 
 def infos_of(recording: Recording, picture: str) -> list[str]:
