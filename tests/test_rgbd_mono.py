@@ -96,3 +96,18 @@ def test_observation_without_an_image_is_not_asked_of_it():
     runner = Runner("rgbd", make(), InStep())
     assert runner.can_use(seen(0)) and runner.can_use(replace(seen(0), depth_m=None))
     assert not runner.can_use(replace(seen(0), image_bgr=None))
+
+
+def test_keyframes_are_of_images_with_depth_while_that_comes_more_rarely():
+    """In a turn, where two images without depth tell no distance; then depth ends."""
+    module, count, ends = make(), 42, 30
+    for index in range(count):
+        at = se3.from_xy_yaw(0.4 - 0.03 * max(index - ends, 0), -1.2, 0.4 + 0.03 * min(index, ends))
+        observation = replace(observation_at(at, index / 30.0), scan=None, T_odom_base=None)
+        if index % 3 or index >= ends:
+            observation = replace(observation, depth_m=None)
+        assert module.track(observation).status is not TrackingStatus.LOST
+    keyframes = module._parts.map.keyframes
+    without_ns = [keyframes[k].stamp_ns for k in keyframes.ids if keyframes[k].is_monocular]
+    assert len(keyframes.ids) - len(without_ns) >= 3
+    assert without_ns and min(without_ns) >= round(ends / 30.0 * 1e9)

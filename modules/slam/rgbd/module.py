@@ -206,10 +206,10 @@ class RgbdSlam(LocalModule, RgbdSettings):
         self._held_ids = fix.landmark_ids
         self._parts.map.count_sightings(fix.expected_ids, fix.landmark_ids)
         segment = self._parts.memory.segment(fix.landmark_ids)
-        wanted = self._parts.keyframe_rule.wants(
-            T_local_base, fix, self._parts.map.keyframes, segment
-        )
-        if wanted and (status is TrackingStatus.TRACKING or (is_by_odometry and view.is_monocular)):
+        rule, keyframes = self._parts.keyframe_rule, self._parts.map.keyframes
+        waits, wanted = rule.waits(view), rule.wants(T_local_base, fix, keyframes, segment)
+        is_known = status is TrackingStatus.TRACKING or (is_by_odometry and view.is_monocular)
+        if wanted and is_known and not waits:
             self._held_ids = self._parts.insert(view, T_local_base, segment, fix=fix)
         self._parts.memory.hold(view.observation.stamp_ns, T_local_base, fix.landmark_ids)
         covariance = prediction.covariance

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Collection
+from statistics import median_low
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +21,7 @@ from .pose_solver import PoseEstimate
 
 _MIN_DEPTH_AGREEMENT_RATIO = 0.2  # with less, image and depth do not show the same place
 
+_DEPTH_GAPS = 2  # between images with depth, after which none is expected
 _SEARCHED_IMAGES = 3  # images searched in the map before a new segment begins
 
 _RECENT = 20  # newest keyframes, which belong to the current path
@@ -56,10 +59,27 @@ class KeyframeRule:
         self._per_rad = 1.0 / settings.keyframe_turn_rad
         self._inlier_ratio = settings.keyframe_inlier_ratio
         self._most_inliers = 0
+        self._deep_ns: int | None = None  # stamp of the last image with depth
+        self._gaps_ns: deque[int] = deque(maxlen=3)  # between the last of these
 
     def restart(self) -> None:
         """Restart after a new keyframe."""
         self._most_inliers = 0
+
+    def waits(self, view: View) -> bool:
+        """Tell whether an image without depth leaves it to the next with depth to be a keyframe.
+
+        Where depth comes at a lower rate than images, that is near, and knows how far landmarks
+        are, also in a turn.
+        """
+        stamp_ns, before_ns = view.observation.stamp_ns, self._deep_ns
+        if view.is_monocular:
+            usual_ns = median_low(self._gaps_ns) if self._gaps_ns else 0
+            return before_ns is not None and stamp_ns - before_ns < _DEPTH_GAPS * usual_ns
+        if before_ns is not None:
+            self._gaps_ns.append(stamp_ns - before_ns)
+        self._deep_ns = stamp_ns
+        return False
 
     def wants(
         self,
