@@ -1,5 +1,7 @@
 """CARMEN logs."""
 
+import logging
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +21,8 @@ from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.se3 import from_xy_yaw
 
 
-def flaser(ranges: list[float], stamp: str, x: float = 1.0) -> str:
-    values = " ".join(f"{one:.2f}" for one in ranges)
+def flaser(ranges: Sequence[float], stamp: str, x: float = 1.0) -> str:
+    values = " ".join(f"{one:.3f}" for one in ranges)
     return f"FLASER {len(ranges)} {values} 9 9 9 {x} 2.0 0.5 {stamp} nohost 0.1"
 
 
@@ -67,6 +69,51 @@ def test_odometry_and_stamp_are_those_of_the_line(tmp_path: Path) -> None:
     (one,) = make_source("carmen", write(tmp_path / "a.log", *lines, "RLASER 1 2 3"))
     np.testing.assert_allclose(one.T_odom_base, from_xy_yaw(1.0, 2.0, 0.5))
     assert one.stamp_ns == 10_123456000
+
+
+@pytest.mark.parametrize("codes_m", [(8.183, 8.191), (10.0,), (5.6,), (4.095,)])
+def test_the_number_that_a_log_writes_for_no_return_is_no_wall(
+    shared_data: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, codes_m: Sequence[float]
+) -> None:
+    """What is beyond the first code is one of them."""
+    lines = (shared_data / "carmen_aces" / "aces.clf").read_text().splitlines()
+    written = []
+    for line in [one for one in lines if one.startswith("FLASER")][:500]:
+        words = line.split()
+        ranges_m = np.array(words[2:182], dtype=float)
+        is_far = ranges_m >= codes_m[0]
+        ranges_m[is_far] = np.resize(codes_m, is_far.sum())
+        written.append(" ".join([*words[:2], *map(str, ranges_m), *words[182:]]))
+    with caplog.at_level(logging.INFO):
+        found = list(make_source("carmen", write(tmp_path / "a.log", *written)))
+    ranges_m = np.concatenate([one.scan.ranges_m for one in found])
+    assert np.isposinf(ranges_m).mean() > 0.04
+    assert ranges_m[np.isfinite(ranges_m)].max() < codes_m[0]
+    assert found[0].scan.range_max_m == pytest.approx(codes_m[-1] - 0.02)
+    (record,) = caplog.records
+    assert f"from {codes_m[-1] - 0.02:.3f} m on" in record.getMessage()
+
+
+def test_two_numbers_for_no_return_may_be_far_apart(tmp_path: Path) -> None:
+    lines = [
+        flaser([2.0, 3.0, 4.0 - 0.1 * at, 8.183, 9.5, 9.5], f"{at}.0", 0.1 * at) for at in range(12)
+    ]
+    for one in make_source("carmen", write(tmp_path / "a.log", *lines)):
+        assert np.isposinf(one.scan.ranges_m[3:]).all()
+        assert np.isfinite(one.scan.ranges_m[:3]).all()
+
+
+def test_a_wall_is_seen_from_a_robot_that_approaches_it_or_stands(tmp_path: Path) -> None:
+    """It fills a third of the view; a robot that stands reads the same number each time."""
+    for name, step_m in (("still", 0.0), ("turns", 0.0), ("approaches", 0.05)):
+        lines = []
+        for at in range(60):
+            front_m = 4.0 - step_m * at
+            turned = np.roll([1.0] * 120 + [front_m] * 60, at if name == "turns" else 0)
+            lines.append(flaser(list(turned), f"{at}.0", step_m * at))
+        found = list(make_source("carmen", write(tmp_path / f"{name}.log", *lines)))
+        assert all(np.isfinite(one.scan.ranges_m).all() for one in found)
+        assert found[0].scan.range_max_m == 80.0
 
 
 def test_the_parameter_places_the_laser(tmp_path: Path) -> None:

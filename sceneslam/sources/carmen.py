@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.ros.pixels import locked
+from sceneslam.sources.carmen_laser import reach_m
 from sceneslam.sources.carmen_lines import (
     FLASER,
     LOGGER_STAMP,
@@ -29,12 +30,14 @@ from sceneslam.types.errors import InputError
 from sceneslam.types.input_files import given_file
 from sceneslam.types.observation import LaserScan, Observation
 from sceneslam.types.rig import Laser, Rig, Sensor, Wheels
+from sceneslam.types.se3 import Transform
 from sceneslam.types.truth import GroundTruth
 
 _LOG = logging.getLogger(__name__)
 _LATE_MAX_NS = 2_000_000_000  # stamps are out of order by less; a clock that is set jumps farther
 _AXLE_M = 0.05  # a log does not say where the laser is above the axle: some centimetres off
 _SAMPLES = 20  # scans that are read for a survey
+_LASER_SAMPLES = 2000  # scans that are read for how far the laser sees
 _OFFSET = b"robot_frontlaser_offset"
 
 
@@ -42,7 +45,7 @@ class Carmen(StampedScans):
     """Gives one observation per FLASER or ROBOTLASER1 line, stamped by its `ipc_timestamp`.
 
     Odometry is that of the line; ODOM and RLASER lines are not used. Ranges of `range_max_m` [m]
-    and beyond count as no return.
+    and beyond count as no return, as does a smaller number that the log writes for it.
 
     Logs are stamped when a computer receives a scan, some late, in bursts and out of order.
     Observations come in the order in which the wheels' path is the shorter one, the lines' or the
@@ -55,21 +58,17 @@ class Carmen(StampedScans):
         self._range_max_m = checked_above_zero("range_max_m", range_max_m)
         self._path = given_file(path, "a CARMEN log")
         self._lines = self._scan_lines()
-        first = next((scan for scan in map(parse_scan, self._lines) if scan), None)
-        if first is None:
-            raise InputError(f"no scans, expected FLASER or ROBOTLASER1 lines: {path}")
+        scans = self._some_scans()
         logged_ns = _logged_stamps(self._lines)
         distinct_ns = _distinct_stamps(logged_ns)
         self._warn_of_changed(np.flatnonzero(distinct_ns != logged_ns), distinct_ns)
         order = _driven_order(self._lines, distinct_ns)
         self._lines = [self._lines[place] for place in order]
         self._logged_ns = distinct_ns[order]
-        T_base_laser = first.T_base_laser
-        if T_base_laser is None:
-            T_base_laser = se3.from_xy_yaw(self._offset_m(), 0.0, 0.0)
+        self._limit_m = self._no_return_m(scans)
         rig = Rig(
             sensors=frozenset({Sensor.SCAN, Sensor.ODOMETRY}),
-            laser=Laser(T_base_laser=T_base_laser),
+            laser=Laser(T_base_laser=self._T_base_laser(scans)),
             wheels=Wheels.given({"axle_m": _AXLE_M, **(wheels or {})}),
         )
         super().__init__(rig, measured_stamps(self._logged_ns))
@@ -117,7 +116,7 @@ class Carmen(StampedScans):
 
     def _observation(self, scan: ScanLine, stamp_ns: int) -> Observation:
         ranges_m = scan.ranges_m
-        limit_m = min(self._range_max_m, scan.range_max_m or np.inf)
+        limit_m = min(self._limit_m, scan.range_max_m or np.inf)
         ranges_m[ranges_m <= 0] = np.nan
         ranges_m[ranges_m >= limit_m] = np.inf
         return Observation(
@@ -150,6 +149,29 @@ class Carmen(StampedScans):
         lines = self._path.read_bytes().splitlines()
         new, old = ([one for one in lines if one.startswith(kind)] for kind in (ROBOTLASER, FLASER))
         return new if len(new) >= len(old) else old
+
+    def _some_scans(self) -> Sequence[ScanLine]:
+        """Return valid scans, spread over the log; raises InputError if it has none."""
+        lines = [self._lines[at] for at in spread(len(self._lines), _LASER_SAMPLES)]
+        scans = [scan for scan in map(parse_scan, lines) if scan]
+        found = scans or [scan for scan in map(parse_scan, self._lines) if scan]
+        if not found:
+            raise InputError(f"no scans, expected FLASER or ROBOTLASER1 lines: {self._path}")
+        return found
+
+    def _no_return_m(self, scans: Sequence[ScanLine]) -> float:
+        """Return the range [m] from which on there is no return."""
+        limit_m = reach_m(scans, self._range_max_m)
+        if limit_m < self._range_max_m:
+            _LOG.info("ranges from %.3f m on are read as no return: %s", limit_m, self._path)
+        return limit_m
+
+    def _T_base_laser(self, scans: Sequence[ScanLine]) -> Transform:
+        """Return where the first line or the log's parameter places the laser (4, 4) [m]."""
+        T_base_laser = scans[0].T_base_laser
+        if T_base_laser is None:
+            T_base_laser = se3.from_xy_yaw(self._offset_m(), 0.0, 0.0)
+        return T_base_laser
 
     def _offset_m(self) -> float:
         """Return the laser's distance [m] in front of the robot's centre, 0 if not logged.
