@@ -149,17 +149,77 @@ def test_frames_of_the_robots_own_namespace_hold_before_those_without_one(
     assert source.rig.laser.T_base_laser[0, 3] == 0.2
 
 
-@pytest.mark.parametrize("robots", [("chassis",), ("one/base_link", "two/base_link")])
-def test_a_laser_without_a_known_base_is_named_where_there_are_transforms(
-    tmp_path: Path, robots: tuple[str, ...]
+def record_placed(path: Path, tree: dict[str, tuple[str, float]], **frames: str) -> Path:
+    """Write `tree`, child -> parent and how far ahead of it [m]; and frames of a scan and an Imu.
+
+    Odometry reports the pose of a frame that is on no transform.
+    """
+    with Recorder(path) as recorder:
+        entries = [recorder.transform(parent, child, x_m) for child, (parent, x_m) in tree.items()]
+        recorder.add("/tf_static", 0, recorder.new("tf2_msgs/msg/TFMessage", transforms=entries))
+        recorder.scan("/scan", STAMP_NS, [1.0, 2.0], frame=frames["scan"])
+        recorder.add("/odom", STAMP_NS, odometry(recorder, STAMP_NS, np.eye(4), "wheels"))
+        if "imu" in frames:
+            data = Encoder().imu(STAMP_NS, {Sensor.GYRO: np.ones(3)})
+            message = get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr(data, "sensor_msgs/msg/Imu")
+            message.header.frame_id = frames["imu"]
+            recorder.add("/imu", STAMP_NS, message)
+    return path
+
+
+ROBOTS = {f"{robot}/laser": (f"{robot}/base_link", x_m) for robot, x_m in (("a", 0.1), ("b", 0.2))}
+BOTH_ON_MAP = ROBOTS | {f"{robot}/base_link": ("map", 1.0) for robot in "ab"}
+ARM = {
+    "a/base_link": ("a/base_footprint", 0.0),
+    "a/arm/base_link": ("a/base_link", 0.3),
+    "a/laser": ("a/base_link", 0.1),
+    "a/imu": ("a/arm/base_link", 0.1),
+}
+
+
+@pytest.mark.parametrize(
+    ("tree", "frames", "x_m"),
+    [
+        (ROBOTS, {"scan": "a/laser"}, 0.1),
+        (ROBOTS, {"scan": "b/laser"}, 0.2),
+        (BOTH_ON_MAP, {"scan": "b/laser", "imu": "imu"}, 0.2),
+        (ARM, {"scan": "a/laser", "imu": "a/imu"}, 0.1),
+        (ROBOTS, {"scan": "laser"}, None),  # neither of both holds it
+    ],
+)
+def test_of_several_bases_the_one_that_holds_the_sensors_is_taken(
+    tmp_path: Path, tree: dict[str, Any], frames: dict[str, str], x_m: float | None
 ) -> None:
+    source = make_source("mcap", record_placed(tmp_path / "a.mcap", tree, **frames))
+    assert source.rig.laser.T_base_laser[0, 3] == pytest.approx(x_m or 0.0)
+    assert (frames["scan"] in source.survey().unplaced) == (x_m is None)
+
+
+@pytest.mark.parametrize(
+    ("tree", "frames", "fit"),
+    [
+        (ROBOTS, {"scan": "a/laser", "imu": "b/laser"}, ["a/base_link", "b/base_link"]),
+        (ARM, {"scan": "a/imu"}, ["a/arm/base_link", "a/base_link"]),
+    ],
+)
+def test_of_several_bases_that_hold_the_sensors_one_has_to_be_given(
+    tmp_path: Path, tree: dict[str, Any], frames: dict[str, str], fit: list[str]
+) -> None:
+    path = record_placed(tmp_path / "a.mcap", tree, **frames)
+    said = rf"base_frame: several .*\({', '.join(fit)}\).* source\.base_frame={fit[0]}"
+    with pytest.raises(InputError, match=said):
+        make_source("mcap", path)
+    make_source("mcap", path, base_frame=fit[0])
+
+
+def test_a_laser_without_a_known_base_is_named_where_there_are_transforms(tmp_path: Path) -> None:
     with Recorder(tmp_path / "a.mcap") as recorder:
-        tree = [recorder.transform(name, f"{name}_laser", 0.5) for name in robots]
+        tree = [recorder.transform("chassis", "laser", 0.5)]
         recorder.add("/tf_static", 0, recorder.new("tf2_msgs/msg/TFMessage", transforms=tree))
-        recorder.scan("/scan", STAMP_NS, [1.0, 2.0], frame=f"{robots[0]}_laser")
+        recorder.scan("/scan", STAMP_NS, [1.0, 2.0], frame="laser")
     source = make_source("mcap", tmp_path / "a.mcap")
-    assert source.survey().unplaced == [f"{robots[0]}_laser"]
-    placed = make_source("mcap", tmp_path / "a.mcap", base_frame=robots[0])
+    assert source.survey().unplaced == ["laser"]
+    placed = make_source("mcap", tmp_path / "a.mcap", base_frame="chassis")
     assert placed.survey().unplaced == [] and placed.rig.laser.T_base_laser[0, 3] == 0.5
 
 

@@ -7,8 +7,9 @@ from itertools import islice
 
 from sceneslam.ros import decode, names
 from sceneslam.sources.bag.recording import Recording
+from sceneslam.sources.bag.topics import first
 from sceneslam.types import se3
-from sceneslam.types.errors import ConfigError
+from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.se3 import Transform
 
 _BASES = ("base_link", "base_footprint", "base")
@@ -37,7 +38,7 @@ class FrameTree:
         if base_frame is not None and base_frame not in frames:
             known = ", ".join(sorted(frames)) or "it has no /tf_static and no /tf"
             raise ConfigError("base_frame", base_frame, f"null or one of the recording's: {known}")
-        self.base = base_frame or _base_of(frames)
+        self.base = base_frame or self._find_base(frames, recording, used)
 
     @property
     def is_empty(self) -> bool:
@@ -64,6 +65,42 @@ class FrameTree:
         while found[-1] in self._up and self._up[found[-1]][0] not in found:
             found.append(self._up[found[-1]][0])
         return found[1:]
+
+    def _find_base(
+        self, frames: Collection[str], recording: Recording, used: Collection[str]
+    ) -> str | None:
+        """Return the frame with a base's name, else the one with it as its last part.
+
+        Of several of these, the one above the sensors `used`; None if none of them is below one.
+        """
+        for name in _BASES:
+            if name in frames:
+                return name
+        for name in _BASES:
+            found = {frame for frame in frames if _last_part(frame) == name}
+            if len(found) > 1:
+                messages = (first(recording, topic) for topic in used)
+                sensors = {decode.frame_id(one) for one in messages if one is not None}
+                return self._base_above(sensors, found)
+            if found:
+                return found.pop()
+        return None
+
+    def _base_above(self, sensors: Collection[str], bases: set[str]) -> str | None:
+        """Return the base above all sensors that are below any, None if none is.
+
+        Raises InputError if several bases are, or none is above all of them.
+        """
+        above = [bases.intersection([frame, *self.above(frame)]) for frame in sensors]
+        above = [found for found in above if found]
+        fit = set.intersection(*above) if above else set()
+        if above and len(fit) != 1:
+            several = sorted(fit or set.union(*above))
+            raise InputError(
+                f"base_frame: several frames hold the sensors ({', '.join(several)}): "
+                f"choose one, such as source.base_frame={several[0]}"
+            )
+        return fit.pop() if fit else None
 
     def _to_root(self, frame: str) -> tuple[str, Transform]:
         T_root_frame = se3.identity()
@@ -92,18 +129,6 @@ def is_beside(topic: str, used: Collection[str]) -> bool:
     """Tell whether a topic's namespace holds one of the topics used."""
     namespace = topic.rpartition("/")[0] + "/"
     return any(one.startswith(namespace) for one in used)
-
-
-def _base_of(frames: Collection[str]) -> str | None:
-    """Return the frame with a base's name, else the one with it as its last part, if it is one."""
-    for name in _BASES:
-        if name in frames:
-            return name
-    for name in _BASES:
-        found = [frame for frame in frames if _last_part(frame) == name]
-        if found:
-            return found[0] if len(found) == 1 else None
-    return None
 
 
 def _last_part(name: str) -> str:
