@@ -18,7 +18,7 @@ from sceneslam.sources.rising import (
     rising_stamps,
 )
 from sceneslam.types.errors import ConfigError, InputError
-from sceneslam.types.se3 import from_xy_yaw
+from sceneslam.types.se3 import from_xy_yaw, yaw_rad
 
 
 def flaser(ranges: Sequence[float], stamp: str, x: float = 1.0) -> str:
@@ -120,6 +120,39 @@ def test_the_parameter_places_the_laser(tmp_path: Path) -> None:
     parameter = "PARAM robot_frontlaser_offset 0.115 nohost 0"
     source = make_source("carmen", write(tmp_path / "a.log", parameter, flaser([1.0] * 180, "1.0")))
     assert source.rig.laser.T_base_laser[0, 3] == 0.115
+
+
+def robotlaser(stamp: int, laser: Sequence[float], robot: Sequence[float]) -> str:
+    poses = " ".join(map(str, (*laser, *robot)))
+    return f"ROBOTLASER1 0 -1.0 2.0 0.5 30.0 0.01 0 3 1 2 3 0 {poses} 0 0 0 0 0 {stamp}.5 host 0"
+
+
+@pytest.mark.parametrize("mount", [(0.25, 0.0, 0.0), (-0.3, 0.1, 3.14159)])
+def test_a_first_line_whose_laser_is_at_the_origin_places_no_laser(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, mount: Sequence[float]
+) -> None:
+    lines = [robotlaser(0, (0.0, 0.0, 0.0), (400.0, 30.0, 1.0))]
+    for at in range(1, 9):
+        T_odom_laser = from_xy_yaw(400.0 + at, 30.0, 1.0 - at) @ from_xy_yaw(*mount)
+        laser = (*T_odom_laser[:2, 3], yaw_rad(T_odom_laser))
+        lines.append(robotlaser(at, laser, (400.0 + at, 30.0, 1.0 - at)))
+    source = make_source("carmen", write(tmp_path / "a.log", *lines))
+    np.testing.assert_allclose(source.rig.laser.T_base_laser, from_xy_yaw(*mount), atol=1e-5)
+    assert caplog.records == []
+
+
+@pytest.mark.parametrize("scale", [0.0, 0.5, 5.0])
+def test_lines_that_place_the_laser_nowhere_leave_it_to_the_parameter(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, scale: float
+) -> None:
+    """The laser's poses are zero, lag behind the robot's, or are far off."""
+    parameter = "PARAM robot_frontlaser_offset 0.115 nohost 0"
+    robots = [(0.5 * at, 1.0, 0.0) for at in range(9)]
+    lines = [robotlaser(at, [scale * one for one in each], each) for at, each in enumerate(robots)]
+    source = make_source("carmen", write(tmp_path / "a.log", parameter, *lines))
+    np.testing.assert_allclose(source.rig.laser.T_base_laser, from_xy_yaw(0.115, 0.0, 0.0))
+    (record,) = caplog.records
+    assert "0.115 m in front of its centre" in record.getMessage()
 
 
 @pytest.mark.parametrize("offset", ["nan", "inf", "-inf", "0,115"])

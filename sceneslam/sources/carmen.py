@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.ros.pixels import locked
-from sceneslam.sources.carmen_laser import reach_m
+from sceneslam.sources.carmen_laser import mounting, reach_m
 from sceneslam.sources.carmen_lines import (
     FLASER,
     LOGGER_STAMP,
@@ -37,7 +37,7 @@ _LOG = logging.getLogger(__name__)
 _LATE_MAX_NS = 2_000_000_000  # stamps are out of order by less; a clock that is set jumps farther
 _AXLE_M = 0.05  # a log does not say where the laser is above the axle: some centimetres off
 _SAMPLES = 20  # scans that are read for a survey
-_LASER_SAMPLES = 2000  # scans that are read for how far the laser sees
+_LASER_SAMPLES = 2000  # scans that are read for where the laser is, and how far it sees
 _OFFSET = b"robot_frontlaser_offset"
 
 
@@ -45,7 +45,8 @@ class Carmen(StampedScans):
     """Gives one observation per FLASER or ROBOTLASER1 line, stamped by its `ipc_timestamp`.
 
     Odometry is that of the line; ODOM and RLASER lines are not used. Ranges of `range_max_m` [m]
-    and beyond count as no return, as does a smaller number that the log writes for it.
+    and beyond count as no return, as does a smaller number that the log writes for it. The laser is
+    where most lines place it, else where the log's parameter does.
 
     Logs are stamped when a computer receives a scan, some late, in bursts and out of order.
     Observations come in the order in which the wheels' path is the shorter one, the lines' or the
@@ -167,11 +168,19 @@ class Carmen(StampedScans):
         return limit_m
 
     def _T_base_laser(self, scans: Sequence[ScanLine]) -> Transform:
-        """Return where the first line or the log's parameter places the laser (4, 4) [m]."""
-        T_base_laser = scans[0].T_base_laser
-        if T_base_laser is None:
-            T_base_laser = se3.from_xy_yaw(self._offset_m(), 0.0, 0.0)
-        return T_base_laser
+        """Return where the lines or, without, the log's parameter place the laser (4, 4) [m]."""
+        T_base_laser = mounting(scans)
+        if T_base_laser is not None:
+            return T_base_laser
+        offset_m = self._offset_m()
+        if any(scan.T_base_laser is not None for scan in scans):
+            _LOG.warning(
+                "the lines do not place the laser at one point of the robot; it is taken to be "
+                "%.3f m in front of its centre: %s",
+                offset_m,
+                self._path,
+            )
+        return se3.from_xy_yaw(offset_m, 0.0, 0.0)
 
     def _offset_m(self) -> float:
         """Return the laser's distance [m] in front of the robot's centre, 0 if not logged.

@@ -1,4 +1,4 @@
-"""What the scans of a CARMEN log say of its laser: where no return begins.
+"""What the scans of a CARMEN log say of its laser: where no return begins, and where it is mounted.
 
 A log does not name the number that its driver writes for no return.
 """
@@ -11,11 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneslam.sources.carmen_lines import ScanLine
+from sceneslam.types import se3
+from sceneslam.types.se3 import Transform
 
 _CODES_M = 0.02  # a SICK in millimetres has error codes from 8.183 to 8.191
 _BELOW_RATIO = 0.9  # real ranges spread over the tenth below the largest one
 _PLACE_M = 0.1  # farther apart, a wall has another range by more than the codes' width
 _PLACES_MIN = 10  # a robot that stood still cannot tell a wall from a number for no return
+_SPREAD = 0.05  # m, and of the cosine and sine of the yaw: more is no mounting
+_FAR_M = 3.0  # no robot carries its laser farther from its centre
 
 
 def reach_m(scans: Sequence[ScanLine], limit_m: float) -> float:
@@ -36,6 +40,22 @@ def reach_m(scans: Sequence[ScanLine], limit_m: float) -> float:
         limit_m = lowest_m
         ranges_m = [one[one < limit_m] for one in ranges_m]
     return limit_m
+
+
+def mounting(scans: Sequence[ScanLine]) -> Transform | None:
+    """Return T_base_laser (4, 4) [m], the median of what lines say; None if that is no mounting.
+
+    Some loggers write a pose of the laser that is zero, or that lags behind the robot's.
+    """
+    mounts = np.array([one.T_base_laser for one in scans if one.T_base_laser is not None])
+    if not len(mounts):
+        return None
+    values = mounts[:, [0, 1, 0, 1], [3, 3, 0, 0]]  # (N, 4): x, y [m], cosine and sine of the yaw
+    x_m, y_m, cosine, sine = median = np.median(values, axis=0)
+    spread = np.median(np.abs(values - median).max(axis=1))
+    if spread > _SPREAD or np.hypot(x_m, y_m) > _FAR_M:
+        return None
+    return se3.from_xy_yaw(float(x_m), float(y_m), float(np.arctan2(sine, cosine)))
 
 
 def _places(scans: Sequence[ScanLine]) -> Sequence[ScanLine]:
