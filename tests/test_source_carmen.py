@@ -55,13 +55,22 @@ def test_the_intel_log_is_read_whole_and_without_fault(
 
 
 @pytest.mark.parametrize(
-    ("count", "degrees"), [(180, 1.0), (181, 1.0), (360, 0.5), (361, 0.5), (400, 0.25), (401, 0.25)]
+    ("count", "step", "first"),
+    [
+        (180, 1.0, -90.0),
+        (181, 1.0, -90.0),
+        (360, 0.5, -90.0),
+        (361, 0.5, -90.0),
+        (400, 0.25, -49.875),
+        (401, 0.25, -50.0),
+        (241, 0.75, -90.0),
+    ],
 )
-def test_the_count_tells_the_step(tmp_path: Path, count: int, degrees: float) -> None:
+def test_the_count_tells_the_angles(tmp_path: Path, count: int, step: float, first: float) -> None:
     path = write(tmp_path / "a.log", flaser([2.0] * count, "10.5"))
     (one,) = make_source("carmen", path)
-    assert one.scan.angle_min_rad == pytest.approx(-np.pi / 2)
-    assert one.scan.angle_step_rad == pytest.approx(np.deg2rad(degrees))
+    assert np.rad2deg(one.scan.angle_min_rad) == pytest.approx(first)
+    assert np.rad2deg(one.scan.angle_step_rad) == pytest.approx(step)
 
 
 def test_odometry_and_stamp_are_those_of_the_line(tmp_path: Path) -> None:

@@ -14,14 +14,8 @@ from sceneslam.types.trajectory import parse_stamp_ns
 
 FLASER, ROBOTLASER = b"FLASER ", b"ROBOTLASER1 "
 IPC_STAMP, LOGGER_STAMP = -3, -1  # places in a line, from its end: when received, when logged
-_HALF_TURN_COUNTS = {
-    180: 1.0,
-    181: 1.0,
-    360: 0.5,
-    361: 0.5,
-    400: 0.25,
-    401: 0.25,
-}  # SICK: degrees per beam
+_HALF_TURN_DEG = {180: 1.0, 181: 1.0, 360: 0.5, 361: 0.5}  # SICK LMS: degrees per beam
+_MIDDLE_DEG = {400: 0.25, 401: 0.25}  # which it measures over 100 degrees alone, in the middle
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -77,10 +71,11 @@ def _flaser(line: bytes) -> ScanLine:
     count = int(words[1])
     ranges_m = _numbers(words, 2, count)
     _, _, _, x_m, y_m, yaw_rad = map(float, words[2 + count : 8 + count])
-    step_deg = _HALF_TURN_COUNTS.get(count, 180.0 / max(count - 1, 1))
+    step_deg = (_HALF_TURN_DEG | _MIDDLE_DEG).get(count, 180.0 / max(count - 1, 1))
+    first_deg = -step_deg * (count - 1) / 2 if count in _MIDDLE_DEG else -90.0
     return ScanLine(
         ranges_m=ranges_m,
-        angle_min_rad=-np.pi / 2,
+        angle_min_rad=float(np.deg2rad(first_deg)),
         angle_step_rad=float(np.deg2rad(step_deg)),
         range_max_m=None,
         T_odom_base=se3.from_xy_yaw(x_m, y_m, yaw_rad),
