@@ -12,6 +12,7 @@ from sceneslam.engine.mailbox import Mailbox, Waited
 from sceneslam.sources.contract.rising_live import RisingLive
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import LaserScan, Observation
+from sceneslam.types.rig import Camera, Rig, Sensor
 
 IMAGE = np.zeros((2, 2, 3), np.uint8)
 AT_ONCE = LiveSettings(rate=100.0)
@@ -341,7 +342,7 @@ def test_jump_of_a_live_robots_odometry_is_told_with_what_it_is_moved_by():
     feed = Feed()
 
     class Wheels:
-        faults = ()
+        rig, faults = Rig(sensors=frozenset({Sensor.ODOMETRY})), ()
 
         def __iter__(self):
             for index in range(10):
@@ -359,7 +360,7 @@ def test_jump_of_a_live_robots_odometry_is_told_with_what_it_is_moved_by():
 
 def test_live_observation_behind_the_one_before_is_left_out_at_once():
     class Backwards:
-        faults = ()
+        rig, faults = Rig(sensors=frozenset({Sensor.IMAGE})), ()
 
         def __iter__(self):
             for stamp_ns in (5, 9, 7, 11):
@@ -368,3 +369,19 @@ def test_live_observation_behind_the_one_before_is_left_out_at_once():
     source = RisingLive(Backwards(), Feed())
     assert [observation.stamp_ns for observation in source] == [5, 9, 11]
     assert "its stamp does not rise: 1 time" in source.faults[0]
+
+
+def test_live_image_of_another_size_than_the_cameras_is_left_out():
+    height, width, _ = IMAGE.shape
+    camera = Camera(size_wh=(width, height), fx=5.0, fy=5.0, cx=4.0, cy=3.0)
+
+    class Halved:
+        rig, faults = Rig(sensors=frozenset({Sensor.IMAGE}), camera=camera), ()
+
+        def __iter__(self):
+            yield Observation(stamp_ns=1, image_bgr=IMAGE)
+            yield Observation(stamp_ns=2, image_bgr=IMAGE[::2, ::2])
+
+    source = RisingLive(Halved(), Feed())
+    assert [observation.image_bgr is not None for observation in source] == [True, False]
+    assert "image_bgr was left out, it has" in source.faults[0]

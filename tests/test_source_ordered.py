@@ -14,7 +14,7 @@ from sceneslam.sources.contract.ordered import Ordered
 from sceneslam.sources.spanned import TimeSpan
 from sceneslam.types.errors import ConfigError
 from sceneslam.types.observation import Observation
-from sceneslam.types.rig import Rig, Sensor
+from sceneslam.types.rig import Camera, Rig, Sensor
 from sceneslam.types.truth import GroundTruth
 
 
@@ -111,6 +111,37 @@ def test_points_that_are_no_numbers_and_empty_images_are_dropped() -> None:
     np.testing.assert_array_equal(found.points_lidar, points[:1])
     assert len(found.point_times_s) == 1
     assert len(ordered.faults) == 3
+
+
+def pictures(*sizes_wh: tuple[int, int]) -> list[Observation]:
+    """Return observations with images and depth of sizes [px]."""
+    return [
+        Observation(
+            stamp_ns=stamp_ns,
+            image_bgr=np.zeros((height, width, 3), np.uint8),
+            depth_m=np.ones((height, width), np.float32),
+        )
+        for stamp_ns, (width, height) in enumerate(sizes_wh)
+    ]
+
+
+def test_images_of_another_size_than_the_cameras_are_left_out() -> None:
+    camera = Camera(size_wh=(8, 6), fx=5.0, fy=5.0, cx=4.0, cy=3.0)
+    rig = Rig(sensors=frozenset({Sensor.IMAGE, Sensor.DEPTH}), camera=camera)
+    ordered = Ordered(Listed(pictures((8, 6), (4, 3), (8, 6), (6, 8)), rig=rig))
+    seen = [(one.image_bgr is not None, one.depth_m is not None) for one in ordered]
+    assert seen == [(True, True), (False, False), (True, True), (False, False)]
+    assert list(ordered.faults) == [
+        f"{name} was left out, it has {size} pixels, not 8x6: 1 time at stamp 0.000000 s"
+        for size in ("4x3", "6x8")
+        for name in ("image_bgr", "depth_m")
+    ]
+
+
+def test_images_of_any_size_pass_where_the_rig_has_no_camera() -> None:
+    ordered = Ordered(Listed(pictures((8, 6), (4, 3))))
+    assert all(one.image_bgr is not None and one.depth_m is not None for one in ordered)
+    assert ordered.faults == []
 
 
 def test_a_point_whose_time_is_no_number_has_that_of_its_observation() -> None:

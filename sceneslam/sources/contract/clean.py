@@ -1,17 +1,19 @@
-"""Removal of values that are not finite, and of invalid odometry, from observations."""
+"""Removal of values that are not finite, and of invalid images and odometry, from observations."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sceneslam.ros.pixels import locked
 from sceneslam.sources.faults import FaultLog, at_stamp
 from sceneslam.types import se3
 from sceneslam.types.observation import Observation
-from sceneslam.types.rig import Sensor
+from sceneslam.types.rig import Camera, Sensor
 from sceneslam.types.se3 import Transform, orthonormal
 
 _FAR_M = 1e8  # more than twice around the Earth
@@ -19,27 +21,31 @@ _ROUNDED = 1e-12  # rounding error per step; more would accumulate over a millio
 _SKEW_MAX = 1e-3  # of R^T R off the identity; the rounding of float32 is a thousandth of that
 
 
-def cleaned(observation: Observation, log: FaultLog) -> Observation:
+def cleaned(observation: Observation, log: FaultLog, camera: Camera | None = None) -> Observation:
     """Return the observation with finite arrays; the same object if nothing had to be removed.
 
     Depth that is not finite becomes 0, missing (REP-118); the time of a point, that of its
-    observation. Empty images, points and gyro samples that are not finite, and odometry that is not
-    a valid pose, are left out. All but depth is counted in `log`.
+    observation. Images that are empty or not of the camera's size, points and gyro samples that are
+    not finite, and odometry that is not a valid pose, are left out. All but depth is counted in
+    `log`.
     """
     changes = {
-        **_pictures(observation, log),
+        **_pictures(observation, log, camera),
         **_points(observation, log),
         **_motion(observation, log),
     }
     return replace(observation, **changes) if changes else observation  # type: ignore[arg-type]
 
 
-def _pictures(observation: Observation, log: FaultLog) -> Mapping[str, object]:
+def _pictures(
+    observation: Observation, log: FaultLog, camera: Camera | None
+) -> Mapping[str, object]:
     changes: dict[str, object] = {}
     for name in ("image_bgr", "depth_m"):
         picture = getattr(observation, name)
-        if picture is not None and picture.size == 0:
-            log.add(f"empty {name}", at_stamp(observation.stamp_ns))
+        fault = None if picture is None else _fault(name, picture, camera)
+        if fault is not None:
+            log.add(fault, at_stamp(observation.stamp_ns))
             changes[name] = None
     depth_m = observation.depth_m
     if depth_m is None or "depth_m" in changes:
@@ -50,6 +56,17 @@ def _pictures(observation: Observation, log: FaultLog) -> Mapping[str, object]:
         if not is_good.any():
             log.add("depth image without one finite value", at_stamp(observation.stamp_ns))
     return changes
+
+
+def _fault(name: str, picture: NDArray[Any], camera: Camera | None) -> str | None:
+    """Return why an image (H, W, ...) cannot be used, None if it can."""
+    size_wh = picture.shape[1::-1]
+    if picture.size == 0:
+        return f"empty {name}"
+    if camera is None or size_wh == tuple(camera.size_wh):
+        return None
+    size, expected = ("x".join(map(str, each)) for each in (size_wh, camera.size_wh))
+    return f"{name} was left out, it has {size} pixels, not {expected}"
 
 
 def _points(observation: Observation, log: FaultLog) -> Mapping[str, object]:

@@ -22,7 +22,7 @@ _PERIODS = 4  # one or two frames lost in a row are common
 
 
 class Ordered(Wrapped):
-    """Leaves out observations whose stamps repeat or run backwards, and values that are NaN.
+    """Leaves out observations whose stamps repeat or run backwards, and invalid values.
 
     Odometry that was reset continues from its last pose.
 
@@ -48,6 +48,7 @@ class Ordered(Wrapped):
         self._log.clear()
         self._rested_s: list[float] = []
         self._odometer, self._rests = Odometer(), Rests(self._max_gap_ns)
+        self._camera = self._source.rig.camera
         last_ns: int | None = None
         period_ns = self._max_gap_ns // _PERIODS  # the longest recent period
         held: Observation | None = None  # after a jump ahead, until the next stamp confirms it
@@ -78,7 +79,8 @@ class Ordered(Wrapped):
         self._tell_of_rests()
 
     def _mended(self, observation: Observation) -> Observation:
-        mended = self._odometer.smooth(cleaned(observation, self._log), self._log)
+        finite = cleaned(observation, self._log, self._camera)
+        mended = self._odometer.smooth(finite, self._log)
         self._rests.take(mended)
         return mended
 

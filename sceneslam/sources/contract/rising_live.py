@@ -38,14 +38,14 @@ class RisingLive(Wrapped):
 
     def __iter__(self) -> Iterator[Observation]:
         """Yield the source's observations by rising stamp."""
-        odometer, last_ns = Odometer(), None
+        odometer, last_ns, camera = Odometer(), None, self._source.rig.camera
         for observation in self._source:
             stamp_ns = observation.stamp_ns
             if last_ns is not None and stamp_ns <= last_ns:
                 self._log.add("observation left out, its stamp does not rise", at_stamp(stamp_ns))
                 continue
             last_ns, before = stamp_ns, odometer.T_smooth_odom
-            mended = odometer.smooth(cleaned(observation, self._log), self._log)
+            mended = odometer.smooth(cleaned(observation, self._log, camera), self._log)
             if not np.array_equal(before, odometer.T_smooth_odom):
                 T_smooth_odom = odometer.T_smooth_odom.ravel().tolist()
                 self._tell("odometry_jump", stamp_ns, T_smooth_odom=T_smooth_odom)
