@@ -149,6 +149,33 @@ def test_frames_of_the_robots_own_namespace_hold_before_those_without_one(
     assert source.rig.laser.T_base_laser[0, 3] == 0.2
 
 
+@pytest.mark.parametrize(
+    ("topic", "parent", "moved_m", "x_m", "is_odd"),
+    [
+        ("/tf_static", "base_link", 0.2, 0.7, True),
+        ("/tf_static", "base_link", 0.0005, 0.5005, False),
+        ("/tf_static", "mast", 0.0, 0.8, True),
+        ("/tf", "base_link", 0.2, 0.5, False),  # it may move there
+    ],
+)
+def test_the_last_transform_of_a_static_frame_holds_and_a_change_is_named(
+    tmp_path: Path, topic: str, parent: str, moved_m: float, x_m: float, is_odd: bool
+) -> None:
+    """As in tf2; two nodes may place one frame, or a calibration may be published again."""
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        for number, (above, at_m) in enumerate((("base_link", 0.5), (parent, 0.5 + moved_m))):
+            tree = [
+                recorder.transform("base_link", "mast", 0.3),
+                recorder.transform(above, "laser", at_m),
+            ]
+            recorder.add(topic, number, recorder.new("tf2_msgs/msg/TFMessage", transforms=tree))
+        recorder.scan("/scan", STAMP_NS, [1.0, 2.0])
+    source = make_source("mcap", tmp_path / "a.mcap")
+    assert source.rig.laser.T_base_laser[0, 3] == pytest.approx(x_m)
+    odd = source.survey().odd
+    assert ["/tf_static places frame 'laser' at different" in one for one in odd] == [True] * is_odd
+
+
 def record_placed(path: Path, tree: dict[str, tuple[str, float]], **frames: str) -> Path:
     """Write `tree`, child -> parent and how far ahead of it [m]; and frames of a scan and an Imu.
 

@@ -163,7 +163,8 @@ class RosBag:
         return [] if self._frames.is_empty and len(found) == 1 else found
 
     def _assumed(self) -> Iterator[str]:
-        """Yield sentences on what is assumed of depth, camera and ground truth."""
+        """Yield sentences on what is assumed of transforms, depth, camera and ground truth."""
+        yield from self._frames.moved()
         yield from unregistered(self._recording, self._topics, self._frames)
         yield from upward(self._recording, self._topics, self._frames)
         if self._truth_frame is None:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from itertools import islice
 
 from sceneslam.ros import decode, names
+from sceneslam.ros.decode import FrameTransform
 from sceneslam.sources.bag.recording import Recording
 from sceneslam.sources.bag.topics import first
 from sceneslam.types import se3
@@ -13,11 +14,12 @@ from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.se3 import Transform
 
 _BASES = ("base_link", "base_footprint", "base")
+_ROUNDING_M, _ROUNDING_RAD = 0.001, 0.001  # of transforms that were written as text
 _FIRST_MOVING = 200  # messages of /tf that are searched for sensor mounts
 
 
 class FrameTree:
-    """The transforms of /tf_static; for frames that are missing there, the first ones of /tf.
+    """The last transforms of /tf_static; for frames that are missing there, the first ones of /tf.
 
     Both may be in a robot's namespace. Where several robots name their frames alike, those of the
     innermost namespace of the topics `used` hold.
@@ -26,15 +28,13 @@ class FrameTree:
     def __init__(
         self, recording: Recording, base_frame: str | None, used: Collection[str] = ()
     ) -> None:
-        self._up: dict[str, tuple[str, Transform]] = {}  # child -> parent, T_parent_child
+        self._up: dict[str, FrameTransform] = {}  # by child
+        self._moved: dict[str, set[str]] = {}  # static topic -> frames that it places differently
         topics = sorted(filter(is_of_transforms, recording.topics))
         topics.sort(key=lambda one: (not is_static(one), not is_beside(one, used), -one.count("/")))
         for topic in topics:
-            count = None if is_static(topic) else _FIRST_MOVING
-            for message in islice(recording.messages({topic}), count):
-                for one in decode.transforms(recording.decode(message)):
-                    self._up.setdefault(one.child, (one.parent, one.T_parent_child))
-        frames = {*self._up, *(parent for parent, _ in self._up.values())}
+            self._up = self._read(recording, topic) | self._up
+        frames = {*self._up, *(one.parent for one in self._up.values())}
         if base_frame is not None and base_frame not in frames:
             known = ", ".join(sorted(frames)) or "it has no /tf_static and no /tf"
             raise ConfigError("base_frame", base_frame, f"null or one of the recording's: {known}")
@@ -62,9 +62,28 @@ class FrameTree:
     def above(self, frame: str) -> Sequence[str]:
         """Return the frames that a frame is placed in, from its parent to its root."""
         found = [frame]
-        while found[-1] in self._up and self._up[found[-1]][0] not in found:
-            found.append(self._up[found[-1]][0])
+        while found[-1] in self._up and self._up[found[-1]].parent not in found:
+            found.append(self._up[found[-1]].parent)
         return found[1:]
+
+    def moved(self) -> Iterator[str]:
+        """Yield a sentence per topic of static transforms that places frames differently."""
+        for topic, frames in self._moved.items():
+            named = ", ".join(map(repr, sorted(frames)))
+            yield f"{topic} places frame {named} at different poses: the last one holds"
+
+    def _read(self, recording: Recording, topic: str) -> dict[str, FrameTransform]:
+        """Return a topic's transforms by child: of a static one the last, as in tf2."""
+        found: dict[str, FrameTransform] = {}
+        count = None if is_static(topic) else _FIRST_MOVING
+        for message in islice(recording.messages({topic}), count):
+            for one in decode.transforms(recording.decode(message)):
+                before = found.setdefault(one.child, one)
+                if is_static(topic):
+                    found[one.child] = one
+                    if not _is_same(before, one):
+                        self._moved.setdefault(topic, set()).add(one.child)
+        return found
 
     def _find_base(
         self, frames: Collection[str], recording: Recording, used: Collection[str]
@@ -105,7 +124,7 @@ class FrameTree:
     def _to_root(self, frame: str) -> tuple[str, Transform]:
         T_root_frame = se3.identity()
         for parent in self.above(frame):
-            T_root_frame = self._up[frame][1] @ T_root_frame
+            T_root_frame = self._up[frame].T_parent_child @ T_root_frame
             frame = parent
         return frame, T_root_frame
 
@@ -129,6 +148,11 @@ def is_beside(topic: str, used: Collection[str]) -> bool:
     """Tell whether a topic's namespace holds one of the topics used."""
     namespace = topic.rpartition("/")[0] + "/"
     return any(one.startswith(namespace) for one in used)
+
+
+def _is_same(before: FrameTransform, now: FrameTransform) -> bool:
+    T_before_now = se3.inverse(before.T_parent_child) @ now.T_parent_child
+    return before.parent == now.parent and se3.is_within(T_before_now, _ROUNDING_M, _ROUNDING_RAD)
 
 
 def _last_part(name: str) -> str:

@@ -135,6 +135,7 @@ class Ros2(Measuring):
             silent=sorted(self.heard.announced.keys() - self.heard.topics.keys()),
             odd=[
                 *oddities(self.heard, [name for name in self._named.values() if name]),
+                *self.frames.moved(),
                 *unregistered(self.heard, self.topics, self.frames),
                 *upward(self.heard, self.topics, self.frames),
                 *odometry_oddities(self.heard, self.topics.odometry, self.frames),
