@@ -40,6 +40,16 @@ BAD = {
         "slam.dark: got 'fakes.Mute', allowed: a target that builds (AssertionError)",
     ),
     "no module": ({"slam": {}}, "slam: got nothing"),
+    "a module's key with a slash": (
+        {"slam": {"a/b": {"_target_": "fakes.ExactModule"}}},
+        "slam: got 'a/b', allowed: a key that can be in the name of a file",
+    ),
+    "a module's key with a backslash": ({"slam": {"a\\b": None}}, r"slam: got 'a\\b', allowed: a"),
+    "a module's key with a line feed": (
+        {"slam": {"a\n": None}},
+        r"slam: got 'a\n', allowed: a key",
+    ),
+    "a module's key beyond a file's name": ({"slam": {"ä" * 101: None}}, "at most 200 bytes"),
     "a scene without a module": ({"scenes__Dark": ...}, "scenes.Dark: got nothing"),
     "an unknown module in the table": ({"scenes__Dark": ["drak"]}, "scenes.Dark: got ['drak']"),
     "an empty list of modules": ({"scenes__Dark": []}, "scenes.Dark: got []"),

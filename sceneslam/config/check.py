@@ -40,6 +40,9 @@ TOP_LEVEL = (
     "source",
     "story",
 )
+_LONGEST_BYTES = (
+    200  # of a module's key: its trajectory's file has 255 for it and what is around it
+)
 
 
 _MOST = {  # largest plausible values by unit; larger ones overflow or never end
@@ -73,13 +76,23 @@ NOTHING = _Nothing()
 
 
 def check_keys(config: Mapping[str, Any]) -> None:
-    """Raise ConfigError for an unknown top-level key, or what `check_given` refuses."""
+    """Raise ConfigError for an unknown top-level key, or what `check_given` refuses.
+
+    So are keys of `slam` that cannot be in the name of a file, such as that of a trajectory.
+    """
     check_given(config, "")
     for key in config:
         if key not in TOP_LEVEL:
             close = difflib.get_close_matches(key, (*TOP_LEVEL, "scenario", "experiment"), n=1)
             hint = f" (did you mean {close[0]}?)" if close else ""
             raise ConfigError(key, config[key], f"{', '.join(TOP_LEVEL)}{hint}")
+    modules = config.get("slam")
+    for key in modules if isinstance(modules, Mapping) else ():
+        if {"/", "\\"} & set(key) or not key.isprintable() or len(key.encode()) > _LONGEST_BYTES:
+            allowed = (
+                f"a key that can be in the name of a file, at most {_LONGEST_BYTES} bytes long"
+            )
+            raise ConfigError("slam", key, f"{allowed}, without / and \\")
 
 
 def check_maps_apart(runs: Iterable[Mapping[str, Any]]) -> None:
