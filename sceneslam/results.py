@@ -54,11 +54,12 @@ class Results:
         """Write the trajectories first, as they are the most important result."""
         with self._noting("the trajectory"):
             self._write_tum(result.trajectory, "trajectory.tum")
-        with self._noting("the other trajectories"):
-            self._write_tum(result.online, "trajectory_online.tum")
-            for session in result.sessions:
-                name = f"trajectory_{session.index}_{session.module}.tum"
-                self._write_tum(session.trajectory, name)
+        others = {"trajectory_online.tum": result.online}
+        for session in result.sessions:
+            others[f"trajectory_{session.index}_{session.module}.tum"] = session.trajectory
+        for name, trajectory in others.items():
+            with self._noting("the other trajectories"):
+                self._write_tum(trajectory, name)
         if len(result.covariances) < len(result.trajectory):
             return  # they failed, as a fault says
         with self._noting("the covariances"):
@@ -173,7 +174,9 @@ class Results:
             yield
         except Exception as error:
             _log.info("%s could not all be saved", what, exc_info=error)
-            self.lose(f"{what} could not all be saved: {text_of(error)}")
+            sentence = f"{what} could not all be saved: {text_of(error)}"
+            if sentence not in self.unsaved:  # as of a full disk, for every trajectory
+                self.lose(sentence)
 
 
 def _unevaluated(result: RunResult) -> RunResult:

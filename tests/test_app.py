@@ -325,6 +325,23 @@ def test_ground_truth_that_cannot_be_written_costs_no_metrics(tmp_path, monkeypa
     assert metrics["errors"] == finished.metrics["errors"] == list(finished.faults)
 
 
+def test_trajectory_of_a_session_that_cannot_be_written_costs_no_other(tmp_path, monkeypatch):
+    write = Trajectory.write_tum
+
+    def fail(trajectory, path):
+        if path.name in ("trajectory_online.tum", "trajectory_0_bright.tum"):
+            raise OSError("the disk is full")
+        write(trajectory, path)
+
+    monkeypatch.setattr(Trajectory, "write_tum", fail)
+    finished = run(config(run__report=False), tmp_path)
+    assert finished.faults == (
+        "the other trajectories could not all be saved: OSError: the disk is full",
+    )
+    written = {path.name for path in tmp_path.glob("traj*.tum")}
+    assert written == {"trajectory.tum", "trajectory_1_dark.tum"}
+
+
 def test_a_module_that_leaves_the_folder_does_not_take_the_results_along(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     leaves = {"_target_": "hostile.Wrecks", "how": "move"}
