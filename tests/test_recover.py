@@ -124,11 +124,29 @@ def test_a_run_at_its_end_has_no_journal_and_is_not_recovered(tmp_path, capsys):
 
 def test_a_second_recovery_finds_nothing_left_to_do(tmp_path, capsys):
     folder = killed(tmp_path, 20)
-    assert main([str(folder)]) == 0
+    assert main([str(folder), "allow_targets=[fakes]"]) == 0
     capsys.readouterr()
     assert main([str(folder)]) == 0
     assert "came to its end" in capsys.readouterr().out
     assert not [path for path in folder.rglob("*") if path.suffix == ".part"]
+
+
+def test_a_source_of_ones_own_is_read_where_the_command_line_allows_it(tmp_path, capsys):
+    folder = killed(tmp_path, 20)
+    assert main([str(folder)]) == 0
+    assert "allow_targets=[fakes]" in capsys.readouterr().err
+    assert not (folder / "groundtruth.tum").exists() and (folder / "journal.bin").exists()
+    assert main([str(folder), "allow_targets=[fakes]"]) == 0
+    assert "missing: the ground truth" not in capsys.readouterr().err
+    assert (folder / "groundtruth.tum").exists() and not (folder / "journal.bin").exists()
+    assert len(Trajectory.read_tum(folder / "trajectory.tum")) == 21
+
+
+def test_another_word_than_a_run_and_what_is_allowed_is_refused(tmp_path, capsys):
+    folder = killed(tmp_path, 5)
+    assert main([str(folder), "seed=1"]) == 2
+    assert "recover: got 'seed=1', allowed: RUN, allow_targets=[NAME]" in capsys.readouterr().err
+    assert not (folder / "trajectory.tum").exists()
 
 
 @pytest.mark.parametrize("cut_bytes", [1, 60, 5000])

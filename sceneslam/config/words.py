@@ -111,6 +111,18 @@ def typed_targets(words: Sequence[str]) -> Any:
     return _plain(typed[-1]) if typed else []
 
 
+def named_targets(word: str | None, program: str, words: str) -> list[str]:
+    """Return the names in `allow_targets=[NAME,...]`, the last of a program's `words`; [] for None.
+
+    Raises ConfigError for another word.
+    """
+    if word is None:
+        return []
+    if not (word.startswith(f"{_TRUST}=[") and word.endswith("]")):
+        raise ConfigError(program, word, f"{words}, {_TRUST}=[NAME]")
+    return list(typed_targets([word]))
+
+
 def takes_rows(table: object) -> bool:
     """Tell whether a table of the configuration can have more rows, under any names."""
     if not isinstance(table, DictConfig) or "_target_" in table:

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from sceneslam.config.words import typed_targets
+from sceneslam.config.words import named_targets
 from sceneslam.mesh.mesh import write_mesh
 from sceneslam.streams import secure_streams
 from sceneslam.types.errors import ConfigError, SceneSlamError, text_of
@@ -21,7 +21,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         if not 0.002 <= options.voxel_m <= 1.0:
             raise ConfigError("--voxel-m", options.voxel_m, "0.002 to 1 m")
-        meshed = write_mesh(options.run.resolve(), options.voxel_m, _names(options.allowed))
+        allowed = named_targets(options.allowed, "mesh", "RUN, --voxel-m")
+        meshed = write_mesh(options.run.resolve(), options.voxel_m, allowed)
     except (SceneSlamError, OSError) as error:
         said = str(error) if isinstance(error, SceneSlamError) else text_of(error)
         print(f"error: {said}", file=sys.stderr)
@@ -43,15 +44,6 @@ def _parser() -> argparse.ArgumentParser:
         help="packages of your own that hold the run's source",
     )
     return parser
-
-
-def _names(word: str | None) -> list[str]:
-    """Return the names in `allow_targets=[NAME,...]`; raises ConfigError for another word."""
-    if word is None:
-        return []
-    if not (word.startswith("allow_targets=[") and word.endswith("]")):
-        raise ConfigError("mesh", word, "RUN, --voxel-m, allow_targets=[NAME]")
-    return list(typed_targets([word]))
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 
+from sceneslam.config.words import named_targets
 from sceneslam.evaluation.report.summary import summary_lines
 from sceneslam.recover.recover import recover
 from sceneslam.storage.folder import RunFolder
@@ -21,6 +22,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     folder: Path = options.run.resolve()
     try:
+        allowed = named_targets(options.allowed, "recover", "RUN")
         if not folder.is_dir():
             raise InputError(f"not the folder of a run: {folder}")
         if not (folder / JOURNAL).exists() and (folder / "trajectory.tum").exists():
@@ -29,7 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if not (folder / JOURNAL).exists():
             raise InputError(f"nothing to recover, there is no {JOURNAL}: {folder}")
         with closing(RunFolder.claim(folder)):
-            recovered = recover(folder)
+            recovered = recover(folder, allowed)
     except (SceneSlamError, OSError) as error:
         said = str(error) if isinstance(error, SceneSlamError) else text_of(error)
         print(f"error: {said}", file=sys.stderr)
@@ -45,6 +47,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m sceneslam.recover", description=__doc__)
     parser.add_argument("run", type=Path, help="the folder of a run that was cut off")
+    parser.add_argument(
+        "allowed",
+        nargs="?",
+        metavar="allow_targets=[NAME]",
+        help="packages of your own that hold the run's source",
+    )
     return parser
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import chdir, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -52,13 +52,18 @@ class Recovered:
     faults: tuple[str, ...]  # errors of saving
 
 
-def recover(folder: Path) -> Recovered:
-    """Write the results of an interrupted run; raises InputError without a journal."""
+def recover(folder: Path, allowed: Sequence[str] = ()) -> Recovered:
+    """Write the results of an interrupted run; raises InputError without a journal.
+
+    `allowed` names the packages of the user that may hold its source. Where the source cannot be
+    read, the journal stays.
+    """
     config = _read_config(folder)
     # `allow_targets` of the file is ignored: only the user may allow code.
     # Submaps need observations, which the journal does not contain.
     poses_alone = {**(config.get("atlas") or {}), "load": None, "save": None, "mode": "extend"}
-    builder = ComponentBuilder(config | {"allow_targets": [], "atlas": poses_alone})
+    trusted = {"allow_targets": list(allowed), "atlas": poses_alone}
+    builder = ComponentBuilder(config | trusted)
     atlas = builder.make("atlas", Atlas)
     kept = read_journal(folder / JOURNAL, _Retold(atlas))
     missing = list(_NEVER_KEPT)
@@ -84,7 +89,7 @@ def recover(folder: Path) -> Recovered:
     reference = _reference(folder, source, kept.observed_ns) if config.get("reference") else None
     metrics = results.save_rest(result, truth, reference=reference, has_costs=False)
     if not results.unsaved:
-        _tidy(folder)
+        _tidy(folder, is_final=source is not None)
     return Recovered(metrics=metrics, missing=tuple(missing), faults=tuple(results.unsaved))
 
 
@@ -216,9 +221,10 @@ def _result(
     )
 
 
-def _tidy(folder: Path) -> None:
-    """Remove the journal and unfinished files."""
+def _tidy(folder: Path, *, is_final: bool) -> None:
+    """Remove unfinished files, and the journal if the recovery is final."""
     unfinished = [name for name in owned(folder) if name.endswith(PART)]
     sinks = [name for name in unfinished if (folder / name.removesuffix(PART)).suffix == ".mcap"]
-    for name in [JOURNAL, "reserve.bin", *(one for one in unfinished if one not in sinks)]:
+    journal = [JOURNAL] if is_final else []
+    for name in [*journal, "reserve.bin", *(one for one in unfinished if one not in sinks)]:
         (folder / name).unlink(missing_ok=True)
