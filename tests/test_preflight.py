@@ -291,7 +291,7 @@ def test_real_recordings_with_their_own_settings_give_no_warning(shared_data):
     sources = [
         tum(shared_data / "tum_fr1_rpy", camera=dict.fromkeys(names)),
         tum(shared_data / "7scenes_redkitchen", 1000.0, kinect),
-        Kitti(str(shared_data / "kitti_raw_2011_09_26_drive_0001"), [1.0, 100.0]),
+        Kitti(str(shared_data / "kitti_raw_2011_09_26_drive_0001"), [1.0, 100.0], 0.205),
         *(Carmen(str(path), 80.0, None) for path in sorted(shared_data.glob("carmen_*/*.clf"))),
         *(bag(shared_data / "bags" / name) for name in ("hokuyo_scan.bag", "hokuyo_scan_db3")),
         *(bag(shared_data / "bags" / name) for name in ("rgbd_3s.bag", "rgbd_3s_ros2.mcap")),

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from ros_recordings import make_source
@@ -44,7 +45,7 @@ def test_the_drive_is_read_with_its_truth(shared_data: Path) -> None:
 
 @pytest.mark.parametrize("name", ["velodyne", "velodyne_points/data"])
 def test_both_layouts_are_read_at_ten_hertz(tmp_path: Path, name: str) -> None:
-    found = list(make_source("kitti", make_folder(tmp_path / "a", name)))
+    found = list(make_source("kitti", make_folder(tmp_path / "a", name), vertical_offset_deg=0.0))
     assert [one.stamp_ns for one in found] == [0, 100_000_000, 200_000_000]
     np.testing.assert_array_equal(found[0].points_lidar, POINTS[:, :3])
 
@@ -146,7 +147,7 @@ def test_scans_come_by_the_numbers_in_their_names(tmp_path: Path) -> None:
     for number in range(11):
         (folder / "velodyne" / f"{number}.bin").write_bytes((POINTS + number).tobytes())
         (folder / "velodyne" / f"._{number}.bin").write_bytes(b"of macOS")
-    source = make_source("kitti", folder)
+    source = make_source("kitti", folder, vertical_offset_deg=0.0)
     for number, one in enumerate(source):
         np.testing.assert_array_equal(one.points_lidar, (POINTS + number)[:, :3])
     assert source.length == 11 and source.faults == []
@@ -178,6 +179,20 @@ def test_points_that_are_no_numbers_are_dropped(tmp_path: Path) -> None:
     assert len(one.points_lidar) == 49
 
 
+def test_points_are_raised_by_the_offset_of_the_lidar(tmp_path: Path) -> None:
+    points = np.vstack([[[10, 0, 0, 0], [0, 0, 5, 0], [0, 0, 0, 0]], POINTS]).astype("<f4")
+    folder = make_folder(tmp_path / "a", count=1)
+    (folder / "velodyne" / "000000.bin").write_bytes(points.tobytes())
+    (one,) = make_source("kitti", folder)
+    assert one.points_lidar[0, 2] == pytest.approx(10 * np.sin(np.deg2rad(0.205)))
+    np.testing.assert_allclose(one.points_lidar[1:3], points[1:3, :3], atol=1e-4)
+    axes = np.cross(POINTS[:, :3], [0.0, 0.0, 1.0])
+    axes *= np.deg2rad(0.205) / np.linalg.norm(axes, axis=1, keepdims=True)
+    pairs = zip(axes, POINTS[:, :3], strict=True)
+    due = [cv2.Rodrigues(axis)[0] @ point for axis, point in pairs]
+    np.testing.assert_allclose(one.points_lidar[3:], due, atol=1e-5)
+
+
 def test_wrong_folders_times_and_ranges_are_one_sentence(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="not found"):
         make_source("kitti", tmp_path / "nowhere")
@@ -186,6 +201,8 @@ def test_wrong_folders_times_and_ranges_are_one_sentence(tmp_path: Path) -> None
     folder = make_folder(tmp_path / "a")
     with pytest.raises(ConfigError, match="range_m"):
         make_source("kitti", folder, range_m=[5.0, 1.0])
+    with pytest.raises(ConfigError, match="vertical_offset_deg"):
+        make_source("kitti", folder, vertical_offset_deg=float("nan"))
     (folder / "times.txt").write_text("0.0\n0.1\n")
     with pytest.raises(InputError, match="expected 3 as there are scans, got 2"):
         make_source("kitti", folder)

@@ -15,7 +15,7 @@ from sceneslam.sources.prefetch import prefetched
 from sceneslam.sources.stamped_scans import StampedScans
 from sceneslam.sources.survey.survey import Stream, Survey, spread
 from sceneslam.types import se3
-from sceneslam.types.errors import InputError
+from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.input_files import files_by_number, given_folder, read_text
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Lidar, Rig, Sensor
@@ -39,10 +39,14 @@ class Kitti(StampedScans):
     a drive), a scan's line is the number in its name, from 0.
     Ground truth is groundtruth_tum.txt, the lidar's poses, or poses*.txt: the camera's poses if
     calib.txt beside it has `Tr` (odometry benchmark, SemanticKITTI), else the lidar's.
+    `vertical_offset_deg` is how much higher the beams are than the files say.
     """
 
-    def __init__(self, path: str, range_m: list[float]) -> None:
+    def __init__(self, path: str, range_m: list[float], vertical_offset_deg: float) -> None:
         low_m, high_m = checked_range_m("range_m", range_m)
+        if not abs(vertical_offset_deg) < 90:
+            raise ConfigError("vertical_offset_deg", vertical_offset_deg, "between -90 and 90")
+        self._offset_rad = float(np.deg2rad(vertical_offset_deg))
         self._files = _scan_files(given_folder(path))
         self._folder = _drive(self._files[0].parent)
         self._times = next((one for name in _TIMES if (one := self._folder / name).is_file()), None)
@@ -71,7 +75,8 @@ class Kitti(StampedScans):
             count=len(self._files),
             stamps_ns=self._stamps_ns,
         )
-        scans = [_read_scan(self._files[at]) for at in spread(len(self._files), _SAMPLES)]
+        files = [self._files[at] for at in spread(len(self._files), _SAMPLES)]
+        scans = [_read_scan(path, self._offset_rad) for path in files]
         assumed = f"no times.txt: the scans are assumed to come at 10 Hz: {self._folder}"
         return Survey(
             streams=[lidar],
@@ -116,7 +121,7 @@ class Kitti(StampedScans):
 
     def _jobs(self) -> Iterator[Callable[[], NDArray[np.float32] | None]]:
         for path in self._files:
-            yield partial(_read_scan, path)
+            yield partial(_read_scan, path, self._offset_rad)
 
 
 def _scan_files(folder: Path) -> Sequence[Path]:
@@ -194,8 +199,11 @@ def _stamp_ns(line: str, path: Path) -> int:
         raise InputError(f"times: expected seconds, got {line[:40]!r}: {path}") from err
 
 
-def _read_scan(path: Path) -> NDArray[np.float32] | None:
-    """Return the finite points (N, 3) [m], lidar, of a file; None if it is empty or cut off."""
+def _read_scan(path: Path, offset_rad: float) -> NDArray[np.float32] | None:
+    """Return the finite points (N, 3) [m], lidar, of a file; None if it is empty or cut off.
+
+    They are raised by `offset_rad`.
+    """
     try:
         data = path.read_bytes() if path.is_file() else b""
     except OSError:
@@ -203,4 +211,13 @@ def _read_scan(path: Path) -> NDArray[np.float32] | None:
     if not data or len(data) % _POINT_BYTES:
         return None
     points = np.frombuffer(data, dtype="<f4").reshape(-1, 4)[:, :3]
-    return locked(np.ascontiguousarray(points[np.isfinite(points).all(axis=1)], dtype=np.float32))
+    return locked(_raised(points[np.isfinite(points).all(axis=1)], offset_rad))
+
+
+def _raised(points: NDArray[np.float32], angle_rad: float) -> NDArray[np.float32]:
+    """Return points (N, 3) [m], each turned by an angle about the axis point x z, towards z."""
+    z_m, flat_m = points[:, 2], np.hypot(points[:, 0], points[:, 1])
+    up = np.divide(z_m, flat_m, out=np.zeros_like(z_m), where=flat_m > 0)
+    cosine, sine = np.float32(np.cos(angle_rad)), np.float32(np.sin(angle_rad))
+    flat_ratio = cosine - sine * up
+    return np.column_stack([points[:, :2] * flat_ratio[:, None], cosine * z_m + sine * flat_m])
