@@ -9,6 +9,7 @@ from test_atlas_submaps import RIG, S, at, pitched, unseen
 from sceneslam.atlas.lasting.saved_map import empty_map
 from sceneslam.atlas.submaps.collector import Collector, Known
 from sceneslam.atlas.submaps.run_graph import RunGraph
+from sceneslam.atlas.submaps.uprights import turning_axis, usual_up
 from sceneslam.types import se3
 
 
@@ -60,3 +61,20 @@ def test_a_run_that_is_mostly_on_a_ramp_is_not_straightened():
     poses = list(accumulate(steps, np.matmul))
     nodes, solved = finished(poses, [T[2, :3] for T in poses])
     np.testing.assert_allclose(solved, nodes, atol=1e-6)
+
+
+@pytest.mark.filterwarnings("error")
+def test_nodes_that_stand_on_their_head_or_lie_on_their_side_have_a_direction():
+    """Wheels whose z is downwards: the first node is that of the map, the other one is not."""
+    up, over, side = np.array([0.0, 0.0, 1.0]), np.diag([1.0, -1.0, -1.0, 1.0]), np.eye(4)
+    side[:3, :3] = [[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]
+    own = Collector(RIG, lambda ns: known_at(at(0.0)), 0, unseen)
+    own.step_to(at(0.0))
+    own.add(0, None, None)
+    own.finish()
+    submaps = [own.chain.submaps[0]] * 2
+    for second in (over, side @ over, side):
+        for nodes in (np.stack([np.eye(4), second]), np.stack([side, second])):
+            for found in (usual_up(submaps, nodes, up), turning_axis(nodes)):
+                assert np.linalg.norm(found) == pytest.approx(1.0)
+    np.testing.assert_array_equal(usual_up(submaps, np.stack([np.eye(4), over]), up), up)

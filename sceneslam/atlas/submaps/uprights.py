@@ -19,6 +19,7 @@ from sceneslam.types.se3 import Transform, Vector
 
 _UP = np.array([0.0, 0.0, 1.0])
 _HEADINGS = 0.1**2  # rad^2: the tilt of modules drifts by 2 degrees, a third of such a spread
+_CANCELLED = 1e-6  # the median of directions that cancel out, and its rounding
 _HELD = np.array([1.0, 0.3, 0.3]) ** 2  # m, rad: a hand lifts and tilts, and walls do not show it
 
 
@@ -58,7 +59,7 @@ def are_steady(
 def usual_up(submaps: Sequence[Submap], T_map_node: NDArray[np.float64], up_node: Vector) -> Vector:
     """Return the usual vertical direction (3,) in the map; `up_node` (3,) if none was measured."""
     ups = [up_node if submap.up is None else submap.up for submap in submaps]
-    up = np.median(np.einsum("nij,nj->ni", T_map_node[:, :3, :3], ups), axis=0)
+    up = _usual(np.einsum("nij,nj->ni", T_map_node[:, :3, :3], ups))
     return np.asarray(up / np.linalg.norm(up))
 
 
@@ -107,14 +108,23 @@ def mount(up_base: Vector) -> Transform:
 def turning_axis(T_map_node: NDArray[np.float64]) -> Vector:
     """Return the direction (3,) in nodes (N, 4, 4) that changes least in the map.
 
-    It is the map's own z, as it usually is in them, if their headings hardly differ.
+    It is the map's own z, as it usually is in them, if their headings hardly differ. It is that of
+    the nodes where they usually lie on their side.
     """
-    x, y, z = np.median(T_map_node[:, 2, :3], axis=0)
+    x, y, z = _usual(T_map_node[:, 2, :3])
+    if abs(z) < _CANCELLED:
+        return _UP
     mean = T_map_node[:, :3, :3].mean(axis=0)
     spread = np.eye(3) - mean.T @ mean  # u' spread u: variance of a direction u in the map
     pulled = _HEADINGS * np.array([x, y]) / z - spread[:2, 2]
     axis = np.append(np.linalg.solve(spread[:2, :2] + _HEADINGS * np.eye(2), pulled), 1.0)
     return np.asarray(axis / np.linalg.norm(axis))
+
+
+def _usual(directions: NDArray[np.float64]) -> Vector:
+    """Return the median (3,) of directions (N, 3), the first one where they cancel out."""
+    median = np.median(directions, axis=0)
+    return np.asarray(directions[0] if np.linalg.norm(median) < _CANCELLED else median)
 
 
 def tilt(T_map_node: NDArray[np.float64], submaps: Sequence[Submap], node: int) -> Transform:
