@@ -406,6 +406,31 @@ def test_camera_info_of_another_camera_is_not_taken(
     assert ("camera_info of /left/image_raw is missing" in caplog.text) == (fx is None)
 
 
+def record_lenses(path: Path, focal_px: list[float], topic: str = "/cam/image_raw") -> Path:
+    """Write images, and as many camera_infos of these focal lengths in K, P is twice K."""
+    with Recorder(path) as recorder:
+        for number, fx in enumerate(focal_px):
+            stamp_ns = STAMP_NS + number * 10**8
+            info = camera_info(p=[2 * fx, 0, 20, 0, 0, 2 * fx, 15, 0])
+            info.k = np.array([fx, 0, 20, 0, fx, 15, 0, 0, 1.0])
+            recorder.add("/cam/camera_info", stamp_ns, info)
+            recorder.image(topic, stamp_ns, COLOR, "bgr8")
+            recorder.image("/cam/depth", stamp_ns, DEPTH, "16UC1")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("zeros", "topic", "fx"),
+    [(3, "/cam/image_raw", 50.0), (150, "/cam/image_raw", 50.0), (3, "/cam/image_rect", 100.0)],
+)
+def test_camera_infos_before_calibration_are_passed_over(
+    tmp_path: Path, zeros: int, topic: str, fx: float
+) -> None:
+    path = record_lenses(tmp_path / "a.mcap", [0.0] * zeros + [50.0] * 150, topic)
+    source = make_source("mcap", path)
+    assert source.rig.camera.fx == fx and source.survey().odd == []
+
+
 def test_given_intrinsics_replace_those_of_a_lens_that_opencv_does_not_have(tmp_path: Path) -> None:
     info = camera_info(p=[0.0] * 8)
     info.distortion_model, info.d = "equidistant", np.full(4, 0.1)

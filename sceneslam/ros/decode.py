@@ -207,17 +207,29 @@ def _sweep_s(message: Any) -> float:
     return sweep_s if sweep_s < SWEEP_MAX_S else 0.0  # 0 for NaN, too
 
 
-def camera(message: Any, *, is_rectified: bool = False) -> Camera | None:
-    """Return the camera of a CameraInfo, None if it is not calibrated: K is zero, or no number.
+def lens(message: Any, *, is_rectified: bool = False) -> NDArray[np.float64]:
+    """Return the lens of a CameraInfo: K (9,) and the distortion (N,), as one array.
 
-    Rectified images have the lens of P, if it is given, without distortion. Raises InputError for
-    a lens that OpenCV does not have.
+    Rectified images have the lens of P, if it is given, without distortion.
     """
     k, d, p = (coefficients(message, letter) for letter in "kdp")
-    if is_rectified and p[0] > 0:
-        k, d = p.reshape(3, 4)[:, :3].ravel(), np.zeros(0)
-    if not (k[0] > 0 and k[4] > 0 and np.isfinite([*k, *d]).all()):
+    return p.reshape(3, 4)[:, :3].ravel() if is_rectified and p[0] > 0 else np.array([*k, *d])
+
+
+def is_calibrated(message: Any, *, is_rectified: bool = False) -> bool:
+    """Tell whether a CameraInfo has a lens: before calibration K is zero, or no number."""
+    of_images = lens(message, is_rectified=is_rectified)
+    return bool(of_images[0] > 0 and of_images[4] > 0 and np.isfinite(of_images).all())
+
+
+def camera(message: Any, *, is_rectified: bool = False) -> Camera | None:
+    """Return the camera of a CameraInfo, None if it is not calibrated.
+
+    Raises InputError for a lens that OpenCV does not have.
+    """
+    if not is_calibrated(message, is_rectified=is_rectified):
         return None
+    k, d = np.split(lens(message, is_rectified=is_rectified), [9])
     model = str(message.distortion_model)
     if d.any() and model not in ("plumb_bob", "rational_polynomial", ""):
         raise InputError(f"distortion model: got {model!r}, allowed: plumb_bob")

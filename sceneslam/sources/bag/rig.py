@@ -19,6 +19,7 @@ from sceneslam.sources.bag.topics import (
     NONE,
     BagTopics,
     first,
+    first_calibrated,
     holds_poses,
     inertial_sensors,
     infos_of,
@@ -148,7 +149,7 @@ def unregistered(recording: Recording, topics: BagTopics, frames: FrameTree) -> 
     T_image_depth = frames.between(*seen_in)
     is_apart = T_image_depth is not None and not np.allclose(T_image_depth, np.eye(4), atol=1e-6)
     of_depth = infos_of(recording, topics.depth or "")[:1]
-    infos = [first(recording, topic) for topic in (topics.camera_info, *of_depth) if topic]
+    infos = [first_calibrated(recording, one) for one in (topics.camera_info, *of_depth) if one]
     lenses = [decode.coefficients(info, "k") for info in infos if info is not None]
     if is_apart or (len(lenses) == 2 and not np.allclose(lenses[0], lenses[1])):
         yield (
@@ -242,13 +243,8 @@ def _camera(
     picture = topics.image or topics.depth or ""
     message = first(recording, picture)
     size_wh = picture_size_wh(recording, topics)
-    info = first(recording, topics.camera_info) if topics.camera_info else None
-    recorded = None
-    if info is not None and (given is None or given.distortion is None):
-        try:
-            recorded = decode.camera(info, is_rectified=bool(_RECTIFIED.search(picture)))
-        except InputError as err:
-            raise InputError(f"{err}; or give source.camera.fx, fy, cx, cy, distortion") from err
+    is_recorded = given is None or given.distortion is None
+    recorded = _recorded(recording, topics) if is_recorded else None
     if recorded is None and given is None:
         if topics.depth is None:
             return None
@@ -273,6 +269,18 @@ def _camera(
         depth_range_m=depth_range_m,
         T_base_cam=optical_to_rep103() if T_base_cam is None else T_base_cam,
     )
+
+
+def _recorded(recording: Recording, topics: BagTopics) -> Camera | None:
+    """Return the camera of the first camera_info with a lens, None without."""
+    is_rectified = bool(_RECTIFIED.search(topics.image or topics.depth or ""))
+    info = None
+    if topics.camera_info:
+        info = first_calibrated(recording, topics.camera_info, is_rectified=is_rectified)
+    try:
+        return None if info is None else decode.camera(info, is_rectified=is_rectified)
+    except InputError as err:
+        raise InputError(f"{err}; or give source.camera.fx, fy, cx, cy, distortion") from err
 
 
 def _way_without_camera(topics: BagTopics) -> str:

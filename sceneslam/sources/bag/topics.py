@@ -18,8 +18,8 @@ from sceneslam.types.rig import Sensor
 
 _log = logging.getLogger(__name__)
 NONE = "none"  # as a topic's name: the sensor is not used
-_FIRST_IMU = 100  # messages searched for both sensors, which may come in messages of their own
-_LATER_IMU = 20  # messages at each of so many times, where a vector of all of these is zero
+_FIRST = 100  # messages searched: gyro and accelerometer may come in messages of their own
+_LATER = 20  # messages at each of so many times, where none of the first ones measures something
 _SPEED_AT_REST = 0.05  # [m/s] or [rad/s]; more than the noise of odometry that stands still
 _HINTS = {"odometry": "; of a robot, the one that is odom -> base_link on /tf"}
 _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
@@ -99,6 +99,18 @@ def first(recording: Recording, topic: str) -> Any:
         decoded = recording.decode(message)
         if decoded is not None:
             return decoded
+    return None
+
+
+def first_calibrated(recording: Recording, camera_info: str, *, is_rectified: bool = False) -> Any:
+    """Return a topic's first CameraInfo with a lens, by samples of its messages; None without.
+
+    Drivers publish zeros until they have read their calibration.
+    """
+    for message in _spread_messages(recording, camera_info):
+        info = recording.decode(message)
+        if info is not None and decode.is_calibrated(info, is_rectified=is_rectified):
+            return info
     return None
 
 
@@ -229,12 +241,12 @@ def _gyros_first(recording: Recording) -> list[str]:
 def _spread_messages(recording: Recording, topic: str) -> Iterator[Message]:
     """Yield a topic's first messages, then some from its whole time."""
     message: Message | None = None
-    for message in islice(recording.messages({topic}), _FIRST_IMU):
+    for message in islice(recording.messages({topic}), _FIRST):
         yield message
     last = recording.last(topic)
     if message is not None and last is not None:
-        for at_ns in np.linspace(message.log_ns, last.log_ns, _LATER_IMU).tolist():
-            yield from islice(recording.messages({topic}, int(at_ns)), _LATER_IMU)
+        for at_ns in np.linspace(message.log_ns, last.log_ns, _LATER).tolist():
+            yield from islice(recording.messages({topic}, int(at_ns)), _LATER)
 
 
 def _camera_info(recording: Recording, picture: str) -> str:
