@@ -10,7 +10,7 @@ from importlib.resources import files
 from typing import Any
 
 from sceneslam.config.build import opened_source
-from sceneslam.config.check import TOP_LEVEL, check_given
+from sceneslam.config.check import TOP_LEVEL, check_given, first_line
 from sceneslam.config.component import ComponentBuilder
 from sceneslam.config.words import is_override
 from sceneslam.interfaces import Live, SlamModule
@@ -110,7 +110,7 @@ def _modules(words: Sequence[str], rig: Rig) -> Iterator[str]:
             requires = ComponentBuilder(config).make(_KEY, SlamModule).requires
         except (ConfigError, InputError) as error:
             _log.debug("slam=%s: %s", name, text_of(error))
-            yield f"{name:12} not tried: {_first_line(error)}"
+            yield f"{name:12} not tried: {first_line(error)}"
             continue
         lacking = [sensors - rig.sensors for sensors in requires]
         if not all(lacking):
@@ -134,7 +134,3 @@ def _proposal(words: Sequence[str], rig: Rig, *, is_live: bool) -> Iterator[str]
 
 def _named(sensors: frozenset[Sensor]) -> list[str]:
     return [sensor.value for sensor in Sensor if sensor in sensors]
-
-
-def _first_line(error: Exception) -> str:
-    return text_of(error).splitlines()[0].removeprefix("ConfigError: ")

@@ -22,7 +22,7 @@ from sceneslam.app import run
 from sceneslam.atlas.atlas import Atlas
 from sceneslam.engine.open_sinks import OpenSinks
 from sceneslam.modules.detectors.grey_mean import GreyMean
-from sceneslam.types.errors import ConfigError, InputError, ModuleError
+from sceneslam.types.errors import ConfigError, InputError, ModuleError, text_of
 
 ERRORS = sorted(hostile.ERRORS.keys() - {"KeyboardInterrupt"})  # that one ends the run
 RAISED = pytest.mark.parametrize(
@@ -82,6 +82,18 @@ def test_a_trajectory_that_is_none_is_left_out(trajectory, caplog):
     is_sound = trajectory == "stamps of another time"
     assert len(faults) == (not is_sound)
     assert ("slam.bright could not give its revised trajectory" in caplog.text) is not is_sound
+
+
+@pytest.mark.parametrize(
+    ("said", "text"),
+    [
+        ("no file:\n  a\r\n\nb\n", "ValueError: no file: a b"),
+        ("/x/two  blanks", "ValueError: /x/two  blanks"),
+        ("\n", "ValueError"),
+    ],
+)
+def test_text_of_an_error_is_one_line(said, text):
+    assert text_of(ValueError(said)) == text
 
 
 @pytest.mark.parametrize(

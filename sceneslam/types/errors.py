@@ -46,6 +46,7 @@ def text_of(error: BaseException) -> str:
         said = str(error)
     except Exception:
         return kind
+    said = " ".join(filter(None, map(str.strip, said.splitlines())))
     return f"{kind}: {said}" if said else kind
 
 
