@@ -41,10 +41,11 @@ class Answering(CloudMap):
 
     def __init__(self):
         super().__init__(voxel_m=0.2, range_max_m=20.0)
-        self.answers, self.added = {}, 0
+        self.answers, self.added, self.guesses_off_m = {}, 0, []
 
     def register(self, cloud, T_local_guess, observation):
         self.source = self.dense = cloud
+        self.guesses_off_m.append(self.guess_off_m)
         answer = self.answers.get(observation.stamp_ns, lambda T: T)
         return answer(T_local_guess)
 
@@ -104,6 +105,18 @@ def test_without_odometry_such_an_answer_is_lost():
     found, _ = driven({4: lambda T: None}, odometry=False)
     assert found[4].status is TrackingStatus.LOST and found[4].covariance is None
     assert found[5].status is TrackingStatus.TRACKING
+
+
+@pytest.mark.parametrize(
+    ("odometry", "speed_max_m_s", "due_m_s"),
+    [(False, 5.0, 5.0), (False, 99.0, 50.0), (True, 5.0, 0.0)],
+)
+def test_only_the_first_motion_of_a_lidar_without_odometry_may_be_any(
+    odometry, speed_max_m_s, due_m_s
+):
+    _, library = driven({}, odometry=odometry, speed_max_m_s=speed_max_m_s)
+    interval_s = (room_observation(1).stamp_ns - room_observation(0).stamp_ns) * 1e-9
+    assert library.guesses_off_m == pytest.approx([0.0, due_m_s * interval_s] + 6 * [0.0])
 
 
 def test_a_cloud_where_nothing_was_seen_before_is_refused():

@@ -29,6 +29,7 @@ class CloudMap(ABC):
     source: Cloud
     dense: Cloud
     capture_m: float = np.inf  # points that a guess puts farther off may be taken for others
+    guess_off_m: float = 0.0  # how far the next guess may be off, as no velocity was measured yet
 
     def __init__(self, *, voxel_m: float, range_max_m: float) -> None:
         self._edge_m, self._range_max_m = voxel_m, range_max_m

@@ -12,6 +12,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from sceneslam.motion.inertia import FASTEST
 from sceneslam.motion.predictor import Prediction, Predictor
 from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError
@@ -85,7 +86,7 @@ class CloudOdometry(LocalModule, Checked, ABC):
         self._speed_max_m_s = self.speed_max_m_s or 0.5 * range_max_m
         self._noise_m = self.noise_m or 0.2 * voxel_m
         self._predictor = Predictor(rig)
-        self._has_map, self._interval_s = False, _INTERVAL_S
+        self._has_map, self._has_moved, self._interval_s = False, False, _INTERVAL_S
 
     def track(self, observation: Observation) -> Tracking:
         """Return T_local_base (4, 4) [m] at the observation."""
@@ -99,6 +100,7 @@ class CloudOdometry(LocalModule, Checked, ABC):
             return self._predictor.bridged(observation, prediction, can_coast=self._has_map)
         if len(cloud) < _POINTS_MIN:
             return self._predictor.bridged(observation, prediction)
+        self._icp.guess_off_m = self._first_off_m(observation, prediction)
         T_local_icp = self._icp.register(cloud, prediction.T_local_base, observation)
         if T_local_icp is None or not np.isfinite(T_local_icp).all():
             return self._predictor.bridged(observation, prediction)
@@ -158,7 +160,16 @@ class CloudOdometry(LocalModule, Checked, ABC):
         interval_s = self._predictor.unmeasured_s(observation)
         self._interval_s += _SHARE * (interval_s - self._interval_s)
         self._predictor.measure(observation, T_local_base, covariance, steps)
+        self._has_moved = True
         return T_local_base
+
+    def _first_off_m(self, observation: Observation, prediction: Prediction) -> float:
+        """Return how far [m] a lidar may be from its first pose; 0 once a motion was measured."""
+        assert self._reader is not None
+        if self._has_moved or prediction.is_measured or self._reader.is_depth:
+            return 0.0
+        fastest_m_s = min(_SIGMAS * float(FASTEST[0]), self._speed_max_m_s)
+        return fastest_m_s * self._predictor.unmeasured_s(observation)
 
     def _is_near(self, cloud: Cloud, observation: Observation, prediction: Prediction) -> bool:
         """Tell whether no point may be taken for another, after a time without a pose."""

@@ -63,13 +63,23 @@ class _KissMap(CloudMap):
             ),
         )
         self._odometry: Any = KissICP(config)
+        self._is_given = settings.initial_threshold_m is not None
 
     def register(
         self, cloud: Cloud, T_local_guess: se3.Transform, observation: Observation
     ) -> se3.Transform:
-        """Return T_local_base (4, 4) [m] of a cloud (N, 3) [m], base."""
+        """Return T_local_base (4, 4) [m] of a cloud (N, 3) [m], base.
+
+        A guess that may be farther off than the threshold is registered coarsely first.
+        """
         self.source, self.dense = self._odometry.voxelize(cloud)
         sigma_m = self._odometry.adaptive_threshold.get_threshold()
+        if self.guess_off_m > sigma_m and not self._is_given:
+            T_local_guess = self._aligned(T_local_guess, self.guess_off_m)
+        return self._aligned(T_local_guess, sigma_m)
+
+    def _aligned(self, T_local_guess: se3.Transform, sigma_m: float) -> se3.Transform:
+        """Return T_local_base (4, 4) [m] of the last cloud, by the kernel `sigma_m`."""
         T_local_base = self._odometry.registration.align_points_to_map(
             points=self.source,
             voxel_map=self._odometry.local_map,

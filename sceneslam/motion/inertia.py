@@ -26,7 +26,7 @@ _LASTS_S = 0.5, 20.0  # shortest and longest time constant of a velocity; it beg
 _CHANGED = np.array([0.1, 0.1]) ** 2  # (m/s)^2, (rad/s)^2: weight of that beginning
 _JUMP = 3.0  # times the acceleration: a larger change of velocity is a jump
 _STEP = np.array([1e-4, 1e-4])  # m, rad: least standard deviation of a predicted step
-_FASTEST = np.array([25.0, 20.0])  # m/s, rad/s: deviation of a velocity that was never measured
+FASTEST = np.array([25.0, 20.0])  # m/s, rad/s: deviation of a velocity that was never measured
 _UNUSED = 1e6  # m^2, rad^2: variance of what is not used
 _MISSED = (0.05, 0.1)  # m, rad: standard deviation of a predicted motion before it is learnt
 
@@ -148,7 +148,7 @@ class Inertia:
             changes = np.repeat((_USUAL[self.has_wheels] * _ACCELERATION * duration_s) ** 2, 3)
             kept, expected = F @ before, F @ self._covariance @ F.T + np.diag(changes)
         else:
-            fastest = np.diag(np.repeat(_FASTEST**2, 3))
+            fastest = np.diag(np.repeat(FASTEST**2, 3))
             expected = seen @ fastest @ seen.T + unseen @ usual @ unseen.T
         gain = expected @ np.linalg.inv(expected + covariance)
         now = kept + gain @ (twist_s - kept)
