@@ -107,7 +107,7 @@ def first_calibrated(recording: Recording, camera_info: str, *, is_rectified: bo
 
     Drivers publish zeros until they have read their calibration.
     """
-    for message in _spread_messages(recording, camera_info):
+    for message in _spread_messages(recording, camera_info, at_each=1):
         info = recording.decode(message)
         if info is not None and decode.is_calibrated(info, is_rectified=is_rectified):
             return info
@@ -238,15 +238,15 @@ def _gyros_first(recording: Recording) -> list[str]:
     return sorted(imus, key=lambda name: Sensor.GYRO not in inertial_sensors(recording, name))
 
 
-def _spread_messages(recording: Recording, topic: str) -> Iterator[Message]:
-    """Yield a topic's first messages, then some from its whole time."""
+def _spread_messages(recording: Recording, topic: str, at_each: int = _LATER) -> Iterator[Message]:
+    """Yield a topic's first messages, then `at_each` at times from its whole length."""
     message: Message | None = None
     for message in islice(recording.messages({topic}), _FIRST):
         yield message
     last = recording.last(topic)
     if message is not None and last is not None:
         for at_ns in np.linspace(message.log_ns, last.log_ns, _LATER).tolist():
-            yield from islice(recording.messages({topic}, int(at_ns)), _LATER)
+            yield from islice(recording.messages({topic}, int(at_ns)), at_each)
 
 
 def _camera_info(recording: Recording, picture: str) -> str:
