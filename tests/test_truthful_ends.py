@@ -25,6 +25,7 @@ from sceneslam.sources.contract.ordered import Ordered
 from sceneslam.sources.simulator.cache import Cache
 from sceneslam.sources.tum_rgbd import TumRgbd
 from sceneslam.storage.folder import RunFolder
+from sceneslam.types import se3
 from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.observation import Observation
 from sceneslam.types.rig import Camera, Rig, Sensor
@@ -115,6 +116,43 @@ def test_rest_is_no_fault_but_a_silent_sensor_is(after, faults, caplog):
     assert len(list(ordered)) == 5
     assert len(ordered.faults) == faults
     assert ("the robot rested" in caplog.text) == (not faults)
+
+
+@pytest.mark.parametrize(("x_m", "faults"), [(0.5, 0), (0.7, 1)])
+def test_a_rest_before_the_first_step_is_compared_with_those_after_it(x_m, faults):
+    steps = [(0.0, 0.0), (60.0, x_m), (61.0, x_m + 0.52), (62.0, x_m + 1.02)]
+    ordered = Ordered(Stamped(*steps))
+    assert len(list(ordered)) == 4
+    assert len(ordered.faults) == faults
+
+
+class Kept(FakeSource):
+    """Observations of a list."""
+
+    def __init__(self, observations):
+        super().__init__(steps=0, dark_from=0)
+        self._given = observations
+
+    def __iter__(self):
+        return iter(self._given)
+
+
+@pytest.mark.parametrize(("lost", "faults"), [(0, 0), (30, 1)])
+def test_a_log_that_is_triggered_by_motion_rests_from_the_first_scan_on(
+    shared_data, caplog, lost, faults
+):
+    """A scan per 0.5 m or 0.5 rad of ACES; the robot stands for 20 s near its start."""
+    source = make_source("carmen", shared_data / "carmen_aces" / "aces.clf")
+    kept = []
+    for one in source:
+        T_prev_curr = se3.inverse(kept[-1].T_odom_base) @ one.T_odom_base if kept else None
+        if T_prev_curr is None or not se3.is_within(T_prev_curr, 0.5, 0.5):
+            kept.append(one)
+    del kept[100 : 100 + lost]
+    ordered = Ordered(Kept(kept))
+    assert list(ordered) == kept
+    assert len(ordered.faults) == faults
+    assert "the robot rested" in caplog.text and "times, at most for 38.9 s" in caplog.text
 
 
 class Images(Stamped):

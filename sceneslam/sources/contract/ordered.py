@@ -28,7 +28,7 @@ class Ordered(Wrapped):
 
     A single stamp that is ahead of its neighbours by more than a few periods is left out too,
     rather than all that follow it. A gap longer than `max_gap_s` is a fault, unless the robot
-    rested: over the gap, odometry moved no farther than between earlier observations.
+    rested: over the gap, odometry moved no farther than between two other observations of the run.
     """
 
     def __init__(self, source: Source, max_gap_s: float = 5.0) -> None:
@@ -37,16 +37,19 @@ class Ordered(Wrapped):
         super().__init__(source)
         self._max_gap_ns = round(max_gap_s * 1e9)
         self._log = FaultLog()
+        self._rests = Rests(self._max_gap_ns)
 
     @property
     def faults(self) -> Sequence[str]:
         """Return the source's faults and counts of what was left out here."""
-        return [*self._source.faults, *self._log.sentences()]
+        gaps = FaultLog()
+        for gap in self._rests.losses:
+            gaps.add(f"no observation for {gap.duration_s:.1f} s", at_stamp(gap.start_ns))
+        return [*self._source.faults, *self._log.sentences(), *gaps.sentences()]
 
     def __iter__(self) -> Iterator[Observation]:
         """Yield the source's observations by rising stamp."""
         self._log.clear()
-        self._rested_s: list[float] = []
         self._odometer, self._rests = Odometer(), Rests(self._max_gap_ns)
         self._camera = self._source.rig.camera
         last_ns: int | None = None
@@ -59,10 +62,8 @@ class Ordered(Wrapped):
                 if is_back and (last_ns is None or stamp_ns > last_ns):
                     self._skip(held)
                 else:
-                    mended = self._mended(held)
-                    self._note_gap(last_ns, mended)
                     last_ns = held.stamp_ns
-                    yield mended
+                    yield self._mended(held)
                 held = None
             if last_ns is not None and stamp_ns <= last_ns:
                 self._skip(observation)
@@ -73,9 +74,7 @@ class Ordered(Wrapped):
                 last_ns = stamp_ns
                 yield self._mended(observation)
         if held is not None:
-            mended = self._mended(held)
-            self._note_gap(last_ns, mended)
-            yield mended
+            yield self._mended(held)
         self._tell_of_rests()
 
     def _mended(self, observation: Observation) -> Observation:
@@ -96,21 +95,12 @@ class Ordered(Wrapped):
         kind = "observation left out, its stamp repeats, runs backwards or jumps"
         self._log.add(kind, at_stamp(observation.stamp_ns))
 
-    def _note_gap(self, last_ns: int | None, observation: Observation) -> None:
-        """Count a gap before an accepted observation."""
-        if last_ns is None or observation.stamp_ns - last_ns <= self._max_gap_ns:
-            return
-        gap_s = (observation.stamp_ns - last_ns) * 1e-9
-        if self._rests.is_after_rest:
-            self._rested_s.append(gap_s)
-        else:
-            self._log.add(f"no observation for {gap_s:.1f} s", at_stamp(last_ns))
-
     def _tell_of_rests(self) -> None:
         """Log gaps in which the robot stood still; no data are lost, so they are no faults."""
-        if self._rested_s:
+        rests = self._rests.rests
+        if rests:
             _LOG.warning(
                 "the robot rested and nothing was recorded, %d times, at most for %.1f s",
-                len(self._rested_s),
-                max(self._rested_s),
+                len(rests),
+                max(gap.duration_s for gap in rests),
             )
