@@ -431,6 +431,25 @@ def test_camera_infos_before_calibration_are_passed_over(
     assert source.rig.camera.fx == fx and source.survey().odd == []
 
 
+@pytest.mark.parametrize(
+    ("focal_px", "given", "is_odd"),
+    [
+        ([300.0, 160.0, 160.0], {}, True),
+        ([300.0, 160.0, 160.0], {"fx": 160.0, "fy": 160.0, "cx": 20.0, "cy": 15.0}, False),
+        ([0.0, 300.0, 300.0], {}, False),
+        ([300.0, 300.0, 0.0], {}, False),
+    ],
+)
+def test_a_lens_that_changes_is_named(
+    tmp_path: Path, focal_px: list[float], given: dict[str, float], is_odd: bool
+) -> None:
+    path = record_lenses(tmp_path / "a.mcap", focal_px)
+    odd = make_source("mcap", path, camera=given).survey().odd
+    first, last = "300, 300, 20, 15", "160, 160, 20, 15"
+    said = f"/cam/camera_info changes: fx, fy, cx, cy are {first} at first and {last} at the end"
+    assert [said in one for one in odd] == [True] * is_odd
+
+
 def test_given_intrinsics_replace_those_of_a_lens_that_opencv_does_not_have(tmp_path: Path) -> None:
     info = camera_info(p=[0.0] * 8)
     info.distortion_model, info.d = "equidistant", np.full(4, 0.1)

@@ -18,6 +18,7 @@ from sceneslam.sources.bag.rig import (
     find_mounts,
     make_rig,
     picture_size_wh,
+    recalibrated,
     sensor_topics,
     unplaced,
     unregistered,
@@ -73,6 +74,7 @@ class RosBag:
             lidar_range_m=given_range_m("lidar_range_m", lidar_range_m),
             wheels=Wheels.given(wheels),
         )
+        self._is_lens_given = given.intrinsics is not None
         self._path = given_path(path)
         self._depth_scale = depth_scale
         self._sync_tolerance_s = sync_tolerance_s
@@ -165,6 +167,8 @@ class RosBag:
     def _assumed(self) -> Iterator[str]:
         """Yield sentences on what is assumed of transforms, depth, camera and ground truth."""
         yield from self._frames.moved()
+        if not self._is_lens_given:
+            yield from recalibrated(self._recording, self._topics)
         yield from unregistered(self._recording, self._topics, self._frames)
         yield from upward(self._recording, self._topics, self._frames)
         if self._truth_frame is None:

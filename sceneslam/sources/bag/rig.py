@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sceneslam.ros import decode, names, pixels
 from sceneslam.sources.bag.frames import FrameTree, has_base_name
@@ -171,6 +172,24 @@ def upward(recording: Recording, topics: BagTopics, frames: FrameTree) -> Iterat
         )
 
 
+def recalibrated(recording: Recording, topics: BagTopics) -> Iterator[str]:
+    """Yield a sentence if the last camera_info has another lens than the one that is used."""
+    is_rectified = _is_rectified(topics)
+    last = recording.last(topics.camera_info) if topics.camera_info else None
+    infos = (_used_info(recording, topics), None if last is None else recording.decode(last))
+    lenses = [
+        decode.lens(info, is_rectified=is_rectified)
+        for info in infos
+        if info is not None and decode.is_calibrated(info, is_rectified=is_rectified)
+    ]
+    if len(lenses) == 2 and not _is_same_lens(lenses[0], lenses[1]):
+        first_px, last_px = (", ".join(f"{k[at]:g}" for at in (0, 4, 2, 5)) for k in lenses)
+        yield (
+            f"{topics.camera_info} changes: fx, fy, cx, cy are {first_px} at first and {last_px} "
+            "at the end; the first ones are used, source.camera.fx and so on replace them"
+        )
+
+
 def find_mounts(recording: Recording, topics: BagTopics, frames: FrameTree) -> Mounts:
     """Return the poses of the IMU and of odometry's frame; the usual ones if not recorded."""
     T_base_imu = _T_base_imu(recording, topics, frames)
@@ -273,14 +292,26 @@ def _camera(
 
 def _recorded(recording: Recording, topics: BagTopics) -> Camera | None:
     """Return the camera of the first camera_info with a lens, None without."""
-    is_rectified = bool(_RECTIFIED.search(topics.image or topics.depth or ""))
-    info = None
-    if topics.camera_info:
-        info = first_calibrated(recording, topics.camera_info, is_rectified=is_rectified)
+    info = _used_info(recording, topics)
     try:
-        return None if info is None else decode.camera(info, is_rectified=is_rectified)
+        return None if info is None else decode.camera(info, is_rectified=_is_rectified(topics))
     except InputError as err:
         raise InputError(f"{err}; or give source.camera.fx, fy, cx, cy, distortion") from err
+
+
+def _used_info(recording: Recording, topics: BagTopics) -> Any:
+    """Return the first camera_info with a lens, None without."""
+    if topics.camera_info is None:
+        return None
+    return first_calibrated(recording, topics.camera_info, is_rectified=_is_rectified(topics))
+
+
+def _is_rectified(topics: BagTopics) -> bool:
+    return bool(_RECTIFIED.search(topics.image or topics.depth or ""))
+
+
+def _is_same_lens(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
+    return one.shape == other.shape and np.allclose(one, other)
 
 
 def _way_without_camera(topics: BagTopics) -> str:
