@@ -194,3 +194,21 @@ def test_points_between_two_beams_do_not_confirm_a_pose():
     pose = np.array([0.0, 0.15, 0.0])
     near, _, _ = _residuals(two, field, _Pairs.of(two, field, pose), pose, 1.0)
     assert (near > 0.1).all()
+
+
+def test_a_motion_that_lets_the_scan_draw_it_on_is_tried_from_where_another_leads():
+    """Wheels run backwards, surely; that nothing is known of the motion predicts nearly the same.
+
+    The search finds nothing better: its window ends before.
+    """
+    reader = ScanSurfaceReader(
+        T_base_laser=se3.identity(), range_max_m=25.0, noise_m=0.01, noise_per_m=0.0
+    )
+    field = LikelihoodField(reader.read(scan_at(room(), se3.identity(), stamp_ns=0)), 0.05)
+    seen = reader.read(scan_at(room(), se3.from_xy_yaw(0.05, 0.0, 0.0), stamp_ns=0))
+    wheels = MotionPrior.of(np.array([-0.01, 0.0, 0.0]), np.diag([2e-3, 2e-3, 5e-3]) ** 2, 0.99)
+    any_motion = MotionPrior.of(np.zeros(3), np.diag([0.3, 0.3, 5e-3]) ** 2, 0.5)
+    matcher = Matcher(window_m=0.01, window_rad=0.01, degeneracy_ratio=0.01, shift_m=0.01)
+    match = matcher.match(seen, field, [wheels, any_motion], novelty=0.15)  # images at 30 Hz
+    assert abs(match.T_local_base[0] - 0.05) < 0.005
+    assert np.argmax(match.probabilities) == 1

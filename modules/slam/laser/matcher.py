@@ -128,24 +128,26 @@ class Matcher:
         best = self._refine(scan_base, field, priors[0].pose, priors[0], shift_m)
         costs = np.array([best.cost, *(best.cost_with(prior) for prior in priors[1:])])
         least = min(best.scan_cost, usual_cost - _UNEVEN)
-        open_to = [
-            k
-            for k, prior in enumerate(priors)
-            if is_apart(prior.off(best.T_local_base))
-            and least + prior.cost_least(best.information) < best.cost
-        ]
+        is_poor = best.cost > usual_cost + _UNEVEN + priors[0].cost_least(best.information)
+        H, at = best.information, best.T_local_base
+        likely = [k for k, one in enumerate(priors) if least + one.cost_least(H) < best.cost]
+        open_to = [k for k in likely if is_apart(priors[k].off(at))]
+        # From nearly the same pose, a motion that holds the scan less may lead it elsewhere.
+        drawn_to = [k for k in likely if is_poor and is_apart(best.drawn_to(priors[k]))]
         matches = {0: [best]}
-        if open_to or best.cost > usual_cost + _UNEVEN + priors[0].cost_least(best.information):
+        if open_to or is_poor:
             found = self._search(scan_base, field, priors)
-            likely = int(np.argmin([prior.cost_at(found) for prior in priors]))
-            for k, start in [(likely, found), *((k, priors[k].pose) for k in open_to if k > 0)]:
+            nearest = int(np.argmin([prior.cost_at(found) for prior in priors]))
+            tried = sorted({*open_to, *drawn_to} - {0})
+            for k, start in [(nearest, found), *((k, priors[k].pose) for k in tried)]:
                 match = self._refine(scan_base, field, start, priors[k], shift_m)
                 matches.setdefault(k, []).append(match)
         likely, best = min(
             ((k, one) for k, some in matches.items() for one in some), key=lambda each: each[1].cost
         )
         for k, some in matches.items():
-            costs[k] = min(one.cost for one in some)
+            cost = min(one.cost for one in some)
+            costs[k] = cost if k in open_to else min(costs[k], cost)
         self._compare(best, len(scan_base))
         weights = np.exp(best.cost - costs)
         noise = max(best.noise, _NOISE_MIN)
