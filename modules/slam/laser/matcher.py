@@ -130,10 +130,10 @@ class Matcher:
         least = min(best.scan_cost, usual_cost - _UNEVEN)
         is_poor = best.cost > usual_cost + _UNEVEN + priors[0].cost_least(best.information)
         H, at = best.information, best.T_local_base
-        likely = [k for k, one in enumerate(priors) if least + one.cost_least(H) < best.cost]
-        open_to = [k for k in likely if is_apart(priors[k].off(at))]
+        rivals = [k for k, one in enumerate(priors) if least + one.cost_least(H) < best.cost]
+        open_to = [k for k in rivals if is_apart(priors[k].off(at))]
         # From nearly the same pose, a motion that holds the scan less may lead it elsewhere.
-        drawn_to = [k for k in likely if is_poor and is_apart(best.drawn_to(priors[k]))]
+        drawn_to = [k for k in rivals if is_poor and is_apart(best.drawn_to(priors[k]))]
         matches = {0: [best]}
         if open_to or is_poor:
             found = self._search(scan_base, field, priors)
