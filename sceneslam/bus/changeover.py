@@ -119,6 +119,7 @@ class Changeover:
         self._verdict: Decision
         self._since_ns: int | None  # when the scene that calls for it began
         self.queue: list[str] = []  # its candidates that were not tried yet
+        self._order: tuple[str, ...] = ()  # all of them, the best first
         self._attempts: list[_Attempt] = []  # best first
         self._trial: _Attempt | None = None
 
@@ -145,12 +146,16 @@ class Changeover:
 
         `since_ns`: when the scene that calls for it began, None for another reason.
         """
-        if self._trial is not None and self._trial.handover is not None:
-            is_ready = self._tracked_ns > 0 and verdict.reason != "scene"  # that begins in the past
-            if not (is_ready and self._trial.runner.key in verdict.to[:1]):
-                self._drop_trial()
         self._now, self._verdict, self._since_ns = now, verdict, since_ns
-        self.queue = list(verdict.to)
+        self.queue, trial = list(verdict.to), self._trial
+        is_ready = self._tracked_ns > 0 and trial is not None and trial.runner.key in verdict.to[:1]
+        if trial is None:
+            pass
+        elif verdict.reason == "scene" or not (is_ready or trial.handover is None):
+            self._drop_trial()  # a scene begins in the past
+        elif trial.runner.key not in self.queue:
+            self.queue.append(trial.runner.key)  # it starts already
+        self._order = tuple(self.queue)
 
     def go_on(self) -> Outcome | None:
         """Advance the change by one candidate or one observation; return None until it is over.
@@ -158,6 +163,8 @@ class Changeover:
         Beside one that keeps a lost robot waiting while it starts, the next starts as well; the
         first that can takes over.
         """
+        if self._is_back():
+            self._end_hurry()
         while self._attempts or self.queue:
             if (not self._attempts or self._is_late()) and not self._start_next():
                 break
@@ -193,10 +200,9 @@ class Changeover:
         """
         if not self._attempts:
             return ""
-        hold, is_held = self._estimator.session.hold, self._estimator.session.health is Health.HELD
-        held_ns = self._estimator.now_ns - (hold.held_since_ns or self._estimator.now_ns)
-        if is_held and self._verdict.reason in _LOSSES and held_ns >= hold.patience_ns:
+        if self._verdict.reason in _LOSSES and self._is_back():
             return "the module tracks again"
+        is_held = self._estimator.session.health is Health.HELD
         choices = self._candidates.of(scene)
         if scene == self._candidates.scene or not choices or choices[:1] == self._verdict.to[:1]:
             return ""
@@ -264,6 +270,22 @@ class Changeover:
             attempt.runner.retire()
         self._attempts = []
 
+    def _end_hurry(self) -> None:
+        """End the attempts beside the first: they are candidates again, each in its turn."""
+        while len(self._attempts) > 1:
+            runner = self._attempts.pop().runner
+            runner.retire()
+            self.queue.append(runner.key)
+            self.queue.sort(key=self._order.index)
+
+    def _is_back(self) -> bool:
+        """Tell whether the active module has tracked for as long as it may be lost."""
+        session, now_ns = self._estimator.session, self._estimator.now_ns
+        since_ns = session.hold.held_since_ns
+        if session.health is not Health.HELD or since_ns is None:
+            return False
+        return now_ns - since_ns >= session.hold.patience_ns
+
     def _leave_others(self) -> None:
         """End the attempts that another was quicker than; the first choice starts on standby."""
         first = next(filter(self._is_first_choice, self._attempts), None)
@@ -281,11 +303,12 @@ class Changeover:
 
         Then another may take over sooner. The paper's (cold) hand-over waits.
         """
-        last, hold = self._attempts[-1], self._estimator.session.hold
-        is_waited_for = self.is_first or self._policy.handover == "cold"
-        if is_waited_for or last.handover is not None or hold.unheld_since_ns is None:
+        hold = self._estimator.session.hold
+        is_waited_for = self.is_first or any(one.handover is not None for one in self._attempts)
+        if is_waited_for or self._policy.handover == "cold" or hold.unheld_since_ns is None:
             return False
-        lost_ns = self._estimator.now_ns - max(hold.unheld_since_ns, last.since_ns)
+        since_ns = max(hold.unheld_since_ns, self._attempts[-1].since_ns)
+        lost_ns = self._estimator.now_ns - since_ns
         return bool(self._inactive()) and lost_ns >= hold.patience_ns
 
     def _inactive(self) -> list[str]:
@@ -294,9 +317,9 @@ class Changeover:
 
     def _start_next(self) -> bool:
         """Begin to start the next candidate; return whether there is one but the active module."""
-        if self._attempts:
-            self.queue = self._inactive()
-        runner, from_ns = self._runners[self.queue.pop(0)], None
+        key = (self._inactive() if self._attempts else self.queue)[0]
+        self.queue.remove(key)
+        runner, from_ns = self._runners[key], None
         if runner is self._estimator.active:
             from_ns = self._estimator.session.hold.adrift_since_ns
             is_adrift = self._verdict.reason == Health.LOST and from_ns is not None
