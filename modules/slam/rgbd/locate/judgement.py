@@ -22,6 +22,7 @@ from .pose_solver import PoseEstimate
 _MIN_DEPTH_AGREEMENT_RATIO = 0.2  # with less, image and depth do not show the same place
 
 _DEPTH_GAPS = 2  # between images with depth, after which none is expected
+_DEPTH_GAP_MAX_NS = 1_000_000_000  # meanwhile, the view is lost: up to 1.2 s waiting was better
 _SEARCHED_IMAGES = 3  # images searched in the map before a new segment begins
 
 _RECENT = 20  # newest keyframes, which belong to the current path
@@ -75,7 +76,8 @@ class KeyframeRule:
         stamp_ns, before_ns = view.observation.stamp_ns, self._deep_ns
         if view.is_monocular:
             usual_ns = median_low(self._gaps_ns) if self._gaps_ns else 0
-            return before_ns is not None and stamp_ns - before_ns < _DEPTH_GAPS * usual_ns
+            is_usual = before_ns is not None and stamp_ns - before_ns < _DEPTH_GAPS * usual_ns
+            return is_usual and usual_ns <= _DEPTH_GAP_MAX_NS
         if before_ns is not None:
             self._gaps_ns.append(stamp_ns - before_ns)
         self._deep_ns = stamp_ns
