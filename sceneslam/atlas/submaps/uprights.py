@@ -87,13 +87,12 @@ def floor_normal(
 ) -> Vector | None:
     """Return the normal (3,) in base of the floor that motions lie in, None if carried by hand.
 
-    It is the axis that base turns about, also where base is mounted askew: who drives straight
-    with a roll does not leave the plane of base's x and y either. Without such an axis it is
-    base's own z, if any.
+    It is base's own z or, where another axis is the steadier one, that: the axis that base turns
+    about. Who drives straight, mounted with a roll, does not leave the plane of x and y either.
     """
     axis = turning_axis(T_map_node)
     axes = [np.tile(normal, (len(T_map_node), 1)) for normal in (axis, _UP)]
-    for normal in (axis, _UP) if are_steady(T_map_node, *axes) else (_UP, axis):
+    for normal in (_UP, axis) if are_steady(T_map_node, *reversed(axes)) else (axis, _UP):
         if are_on_floor(edges, T_map_node, normal, usual_up(submaps, T_map_node, normal)):
             return normal
     return None
