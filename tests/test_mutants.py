@@ -143,7 +143,7 @@ def test_scenes_without_a_fallback_and_rows_nobody_asks_for_are_said(caplog):
     with caplog.at_level(logging.WARNING):
         build(tree)
     assert [record.getMessage() for record in caplog.records] == [
-        "scenes.Dark: dark has no fallback; without it the run ends",
+        "scenes.Dark: dark has no fallback; without it, poses are bridged until another scene",
         "scenes.Dusk: the detector does not report this scene",
     ]
 

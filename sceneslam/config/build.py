@@ -207,7 +207,8 @@ def _tell_of_rows(table: Mapping[str, Any], scenes: Mapping[str, Sequence[str]])
             _log.warning("scenes.%s: the detector does not report this scene", scene)
         elif len(scenes[scene]) == 1 and len(_used(scenes)) > 1:
             (key,) = scenes[scene]
-            _log.warning("scenes.%s: %s has no fallback; without it the run ends", scene, key)
+            what = "without it, poses are bridged until another scene"
+            _log.warning("scenes.%s: %s has no fallback; %s", scene, key, what)
 
 
 def _group(config: Mapping[str, Any], key: str) -> Mapping[str, Any]:
