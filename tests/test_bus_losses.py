@@ -204,25 +204,3 @@ def test_what_started_beside_a_slow_module_does_not_replace_one_that_tracks_agai
     _, _, log, _ = drive(modules, steps=160, table=table, scene_at=dark_from(20), **options)
     assert [one["to"] for one in events(log, "decision")] == ["bright"]
     assert modules["bright"].scenes[-1] == "Dark" and modules["last"].activations == 0
-
-
-def test_a_first_choice_that_starts_on_standby_is_used_before_a_slower_last_one():
-    lost = [*range(56, 60), *range(68, 1000)]
-    modules = {
-        "first": ExactModule(lost=range(30, 45)),
-        "second": ExactModule(lost=lost),
-        "last": ExactModule(),
-    }
-    startup_s = {"first": 4.5, "last": 20.0}
-    _, _, log, _ = drive(
-        modules,
-        steps=250,
-        table={"Bright": ["first", "second", "last"], "Dark": ["first"]},
-        handover="rewind",
-        startup_s=startup_s,
-        lost_patience_s=1.0,
-        retry_s=2.0,
-        confirm_window_s=2.0,
-    )
-    decisions = [(one["to"], one["stamp_ns"] / 1e9) for one in events(log, "decision")]
-    assert decisions[-1][0] == "first" and decisions[-1][1] < 15.0
