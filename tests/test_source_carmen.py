@@ -156,7 +156,8 @@ def test_lines_that_place_the_laser_nowhere_leave_it_to_the_parameter(
 ) -> None:
     """The laser's poses are zero, lag behind the robot's, or are far off."""
     parameter = "PARAM robot_frontlaser_offset 0.115 nohost 0"
-    robots = [(0.5 * at, 1.0, 0.0) for at in range(9)]
+    robots = [(0.5 * at, 1.0, 0.1 * at) for at in range(9)]
+    robots += 20 * [(0.5, 0.2, 3.1)]  # where it is parked
     lines = [robotlaser(at, [scale * one for one in each], each) for at, each in enumerate(robots)]
     source = make_source("carmen", write(tmp_path / "a.log", parameter, *lines))
     np.testing.assert_allclose(source.rig.laser.T_base_laser, from_xy_yaw(0.115, 0.0, 0.0))

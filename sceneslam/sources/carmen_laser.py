@@ -45,9 +45,11 @@ def reach_m(scans: Sequence[ScanLine], limit_m: float) -> float:
 def mounting(scans: Sequence[ScanLine]) -> Transform | None:
     """Return T_base_laser (4, 4) [m], the median of what lines say; None if that is no mounting.
 
-    Some loggers write a pose of the laser that is zero, or that lags behind the robot's.
+    Some loggers write a pose of the laser that is zero, or that lags behind the robot's. Each place
+    counts once: of a robot that is parked, a wrong one is the same all the time.
     """
-    mounts = np.array([one.T_base_laser for one in scans if one.T_base_laser is not None])
+    told = [one.T_base_laser for one in _places(scans)]
+    mounts = np.array([T_base_laser for T_base_laser in told if T_base_laser is not None])
     if not len(mounts):
         return None
     values = mounts[:, [0, 1, 0, 1], [3, 3, 0, 0]]  # (N, 4): x, y [m], cosine and sine of the yaw
