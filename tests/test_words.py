@@ -119,6 +119,15 @@ def test_our_own_folder_and_a_copy_of_it_are_read(tmp_path):
         assert composed(("+scenario=single",), folder)["slam"]
 
 
+def test_a_copy_of_our_folder_may_replace_it(tmp_path):
+    mine = shutil.copytree(ROOT / "conf", tmp_path / "mine")
+    laser = mine / "slam" / "laser.yaml"
+    laser.write_text(laser.read_text().replace("range_max_m: 25.0", "range_max_m: 3.5"))
+    words = ("+scenario=single", "slam@slam.only=laser", "--cfg", "job")
+    done = call(tmp_path, "--config-path", str(mine), *words)
+    assert done.returncode == 0 and "range_max_m: 3.5" in done.stdout
+
+
 @pytest.mark.parametrize(
     ("words", "has_rows"),
     [

@@ -24,7 +24,8 @@ class CheckedFiles(FileConfigSource):
 
     def __init__(self, provider: str, path: str) -> None:
         super().__init__(provider, path)
-        check_names(Path(self.path))
+        if provider != "main":  # `--config-path` replaces ours
+            check_names(Path(self.path))
 
     def load_config(self, config_path: str) -> ConfigResult:
         """Return a file's contents; raises InputError if it is too large."""
