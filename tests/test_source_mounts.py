@@ -211,6 +211,7 @@ ARM = {
         (ROBOTS, {"scan": "b/laser"}, 0.2),
         (BOTH_ON_MAP, {"scan": "b/laser", "imu": "imu"}, 0.2),
         (ARM, {"scan": "a/laser", "imu": "a/imu"}, 0.1),
+        (ARM, {"scan": "a/imu"}, 0.4),  # the outermost
         (ROBOTS, {"scan": "laser"}, None),  # neither of both holds it
     ],
 )
@@ -226,7 +227,6 @@ def test_of_several_bases_the_one_that_holds_the_sensors_is_taken(
     ("tree", "frames", "fit"),
     [
         (ROBOTS, {"scan": "a/laser", "imu": "b/laser"}, ["a/base_link", "b/base_link"]),
-        (ARM, {"scan": "a/imu"}, ["a/arm/base_link", "a/base_link"]),
     ],
 )
 def test_of_several_bases_that_hold_the_sensors_one_has_to_be_given(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property, partial
 from itertools import islice
 from typing import Any
@@ -86,6 +87,8 @@ class RosBag:
         try:
             self._topics = choose_topics(self._recording, topics)
             self._by_sensor = sensor_topics(self._recording, self._topics)
+            if Sensor.ODOMETRY not in self._by_sensor:  # as it holds no poses
+                self._topics = replace(self._topics, odometry=None)
             self._primary = self._choose_primary()
             self._frames = FrameTree(self._recording, base_frame, self._by_sensor.values())
             self._rig = make_rig(

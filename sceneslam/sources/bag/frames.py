@@ -106,15 +106,16 @@ class FrameTree:
         return None
 
     def _base_above(self, sensors: Collection[str], bases: set[str]) -> str | None:
-        """Return the base above all sensors that are below any, None if none is.
+        """Return the base above all sensors that are below any, the outermost; None if none is.
 
-        Raises InputError if several bases are, or none is above all of them.
+        Raises InputError if none is above all of them.
         """
         above = [bases.intersection([frame, *self.above(frame)]) for frame in sensors]
         above = [found for found in above if found]
         fit = set.intersection(*above) if above else set()
-        if above and len(fit) != 1:
-            several = sorted(fit or set.union(*above))
+        fit = {frame for frame in fit if not fit.intersection(self.above(frame))}
+        if above and not fit:
+            several = sorted(set.union(*above))
             raise InputError(
                 f"base_frame: several frames hold the sensors ({', '.join(several)}): "
                 f"choose one, such as source.base_frame={several[0]}"
