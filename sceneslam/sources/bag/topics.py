@@ -19,6 +19,7 @@ from sceneslam.types.rig import Sensor
 _log = logging.getLogger(__name__)
 NONE = "none"  # as a topic's name: the sensor is not used
 _FIRST = 100  # messages searched: gyro and accelerometer may come in messages of their own
+_FIRST_SLOW = 10  # the same where the images between have to be decompressed slowly
 _LATER = 20  # messages at each of so many times, where none of the first ones measures something
 _SPEED_AT_REST = 0.05  # [m/s] or [rad/s]; more than the noise of odometry that stands still
 _HINTS = {"odometry": "; of a robot, the one that is odom -> base_link on /tf"}
@@ -107,7 +108,8 @@ def first_calibrated(recording: Recording, camera_info: str, *, is_rectified: bo
 
     Drivers publish zeros until they have read their calibration.
     """
-    for message in _spread_messages(recording, camera_info, at_each=1):
+    at_first = _FIRST_SLOW if recording.is_slow else _FIRST
+    for message in _spread_messages(recording, camera_info, at_each=1, at_first=at_first):
         info = recording.decode(message)
         if info is not None and decode.is_calibrated(info, is_rectified=is_rectified):
             return info
@@ -238,10 +240,12 @@ def _gyros_first(recording: Recording) -> list[str]:
     return sorted(imus, key=lambda name: Sensor.GYRO not in inertial_sensors(recording, name))
 
 
-def _spread_messages(recording: Recording, topic: str, at_each: int = _LATER) -> Iterator[Message]:
+def _spread_messages(
+    recording: Recording, topic: str, *, at_each: int = _LATER, at_first: int = _FIRST
+) -> Iterator[Message]:
     """Yield a topic's first messages, then `at_each` at times from its whole length."""
     message: Message | None = None
-    for message in islice(recording.messages({topic}), _FIRST):
+    for message in islice(recording.messages({topic}), at_first):
         yield message
     last = recording.last(topic)
     if message is not None and last is not None:
