@@ -57,7 +57,7 @@ def test_a_revised_session_carries_the_next_one_with_it(twist, error, placed):
 
 @given(twist=twists, error=twists, placed=twists)
 def test_a_session_starts_where_the_last_pose_ended_that_it_did_not_replace(twist, error, placed):
-    """The first module is wrong from 3 on; a pose is bridged before the next session, one in it."""
+    """The first module is wrong from 3 on; a pose is bridged before the second and in it."""
     atlas = Atlas(voxel_m=0.05)
     true, T_map_local, T_new_told = drive(8, 0.1 * twist), se3.exp(placed), se3.exp(0.1 * error)
     wrong = [0.0, 0.01, 0.02, 1.0, 2.0]

@@ -147,14 +147,14 @@ class Changeover:
         `since_ns`: when the scene that calls for it began, None for another reason.
         """
         self._now, self._verdict, self._since_ns = now, verdict, since_ns
-        self.queue, trial = list(verdict.to), self._trial
-        is_ready = self._tracked_ns > 0 and trial is not None and trial.runner.key in verdict.to[:1]
-        if trial is None:
-            pass
-        elif verdict.reason == "scene" or not (is_ready or trial.handover is None):
-            self._drop_trial()  # a scene begins in the past
-        elif trial.runner.key not in self.queue:
-            self.queue.append(trial.runner.key)  # it starts already
+        self.queue = list(verdict.to)
+        if self._trial is not None:
+            key, is_starting = self._trial.runner.key, self._trial.handover is None
+            is_ready = self._tracked_ns > 0 and key in verdict.to[:1]
+            if verdict.reason == "scene" or not (is_ready or is_starting):
+                self._drop_trial()  # a scene begins in the past
+            elif key not in self.queue:
+                self.queue.append(key)  # it starts already
         self._order = tuple(self.queue)
 
     def go_on(self) -> Outcome | None:

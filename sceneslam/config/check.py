@@ -40,9 +40,7 @@ TOP_LEVEL = (
     "source",
     "story",
 )
-_LONGEST_BYTES = (
-    200  # of a module's key: its trajectory's file has 255 for it and what is around it
-)
+_LONGEST_BYTES = 200  # of a module's key: the name of its trajectory's file may have 255
 
 
 _MOST = {  # largest plausible values by unit; larger ones overflow or never end

@@ -90,9 +90,9 @@ def floor_normal(
     It is base's own z or, where another axis is the steadier one, that: the axis that base turns
     about. Who drives straight, mounted with a roll, does not leave the plane of x and y either.
     """
-    axis = turning_axis(T_map_node)
-    axes = [np.tile(normal, (len(T_map_node), 1)) for normal in (axis, _UP)]
-    for normal in (_UP, axis) if are_steady(T_map_node, *reversed(axes)) else (axis, _UP):
+    normals = _UP, turning_axis(T_map_node)
+    ups, axes = (np.tile(normal, (len(T_map_node), 1)) for normal in normals)
+    for normal in normals if are_steady(T_map_node, ups, axes) else reversed(normals):
         if are_on_floor(edges, T_map_node, normal, usual_up(submaps, T_map_node, normal)):
             return normal
     return None

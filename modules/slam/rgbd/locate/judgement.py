@@ -22,7 +22,7 @@ from .pose_solver import PoseEstimate
 _MIN_DEPTH_AGREEMENT_RATIO = 0.2  # with less, image and depth do not show the same place
 
 _DEPTH_GAPS = 2  # between images with depth, after which none is expected
-_DEPTH_GAP_MAX_NS = 1_000_000_000  # meanwhile, the view is lost: up to 1.2 s waiting was better
+_DEPTH_GAP_MAX_NS = 1_000_000_000  # in more, the view leaves the map: from 1.4 s on it was lost
 _SEARCHED_IMAGES = 3  # images searched in the map before a new segment begins
 
 _RECENT = 20  # newest keyframes, which belong to the current path
