@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from rgbd_features import features_at, random_descriptors
 
 from sceneslam.modules.slam.rgbd.locate.matching import match_anywhere, match_near
@@ -37,13 +38,14 @@ def scene(rng, count=200):
             depth_m=depth_m,
             inverse_depth_sigma_per_m=np.full(count, 0.003),
         ),
+        images=np.ones(count, np.int64),
     )
     return T_local_base, measured
 
 
 def changed(measured, **fields):
-    points_local = fields.pop("points_local", measured.points_local)
-    return Measurements(points_local=points_local, seen=replace(measured.seen, **fields))
+    outer = {name: fields.pop(name) for name in ("points_local", "images") if name in fields}
+    return replace(measured, seen=replace(measured.seen, **fields), **outer)
 
 
 def expected_at(uv_px, descriptors):
@@ -120,6 +122,44 @@ def test_pose_is_found_despite_a_third_of_outliers():
     assert estimate.inliers[:66].mean() < 0.1
 
 
+def passed(rng, room_images, thing_images):
+    """Return T_local_base and a view in which a thing before most of the room moved by 13 px."""
+    T_local_base, measured = scene(rng)
+    uv_px = measured.seen.uv_px + rng.normal(0, 0.5, (200, 2))
+    uv_px[:150, 0] += 13.0
+    images = np.repeat([thing_images, room_images], [150, 50])
+    return T_local_base, changed(measured, uv_px=uv_px, images=images)
+
+
+@pytest.mark.parametrize("find", ["approach", "refine", "search"])
+def test_a_thing_that_moves_before_a_known_room_moves_no_camera(find):
+    """The thing shows more landmarks than the room, found when its image became a keyframe."""
+    T_local_base, measured = passed(np.random.default_rng(0), room_images=5, thing_images=1)
+    solver = PoseSolver(CAMERA, seed=0)
+    found = getattr(solver, find)(*((measured,) if find == "search" else (measured, T_local_base)))
+    off = se3.log(se3.inverse(T_local_base) @ found.T_local_base)
+    assert np.linalg.norm(off) < (0.05 if find == "search" else 0.005)
+
+
+def test_where_no_landmark_is_known_better_the_most_decide():
+    T_local_base, measured = passed(np.random.default_rng(0), room_images=1, thing_images=1)
+    found = PoseSolver(CAMERA, seed=0).search(measured)
+    assert np.count_nonzero(found.inlier_rows < 150) > 100
+    assert np.linalg.norm(se3.log(se3.inverse(T_local_base) @ found.T_local_base)) > 0.015
+
+
+def test_new_landmarks_that_agree_make_a_pose_more_accurate():
+    def error(images):
+        T_local_base, measured = scene(rng := np.random.default_rng(4))
+        uv_px = measured.seen.uv_px + rng.normal(0, 1.0, (200, 2))
+        measured = changed(measured, uv_px=uv_px, depth_m=np.zeros(200), images=images)
+        found = PoseSolver(CAMERA, seed=0).refine(measured, T_local_base)
+        return np.sqrt(np.trace(found.covariance[:3, :3]))
+
+    few = np.repeat([9, 1], [25, 175])
+    assert error(few) == pytest.approx(error(np.full(200, 9)), rel=0.15)
+
+
 def test_pose_without_any_depth_is_still_found():
     T_local_base, measured = scene(np.random.default_rng(0))
     measured = changed(measured, depth_m=np.zeros(200))
@@ -146,6 +186,7 @@ def test_a_wall_whose_tilt_is_mistaken_moves_no_camera_that_a_gyro_leads():
             depth_m=np.zeros(200),
             inverse_depth_sigma_per_m=np.full(200, 0.003),
         ),
+        images=np.ones(200, np.int64),
     )
     solver = PoseSolver(CAMERA, seed=0)
     deviations = np.array([0.05] * 3 + [0.001] * 3)

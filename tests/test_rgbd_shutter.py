@@ -57,7 +57,10 @@ def after_watching(readout_s, *, images=60):
             depth_m=points[:, 2],
             inverse_depth_sigma_per_m=np.full(LANDMARKS, 0.003),
         )
-        estimate = solver.refine(Measurements(points_local=points, seen=seen), np.eye(4))
+        estimate = solver.refine(
+            Measurements(points_local=points, seen=seen, images=np.ones(len(points), np.int64)),
+            np.eye(4),
+        )
         slope_px = moves_px_per_s(CAMERA, straight.uv_px[estimate.inliers], rate_cam)
         shutter.learn(estimate.linearised, slope_px)
         shutter.step_s()
@@ -90,7 +93,7 @@ def estimate_of(points, uv_px):
         depth_m=points[:, 2],
         inverse_depth_sigma_per_m=np.full(LANDMARKS, 0.003),
     )
-    measured = Measurements(points_local=points, seen=seen)
+    measured = Measurements(points_local=points, seen=seen, images=np.ones(len(points), np.int64))
     return PoseSolver(CAMERA, seed=0).refine(measured, np.eye(4))
 
 

@@ -179,10 +179,14 @@ class VisualLocalizer:
             depth_m=features.depth_m[rows],
             inverse_depth_sigma_per_m=np.hypot(inverse_depth_sigmas, doubts.inverse_depth_per_m),
         )
-        points_local = self._map.landmarks.points_local.take(ids, axis=0)
+        landmarks = self._map.landmarks
         return _Found(
             expected_ids=expected_ids,
             landmark_ids=ids,
             feature_rows=rows,
-            measured=Measurements(points_local=points_local, seen=seen),
+            measured=Measurements(
+                points_local=landmarks.points_local.take(ids, axis=0),
+                seen=seen,
+                images=landmarks.found.take(ids),
+            ),
         )

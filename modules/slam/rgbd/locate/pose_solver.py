@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -20,6 +21,11 @@ _RANSAC_TRIALS = 200
 _RANSAC_CONFIDENCE = 0.999
 _APPROACH_STEPS, _REFINEMENT_STEPS = 2, 5
 _SMALL_STEP = 0.3  # [sigma], size of the last step; a third of it remains
+# What moves was found in few images where it is now. Swept over fourteen runs with a passer-by,
+# see experiments/moving_things.md.
+_PROVEN_IMAGES = (3, 10)  # a landmark is proven if found in 3, where many were in more of them
+_PROVEN = 100  # landmarks, which are many
+_LEAST_PROVEN = 20  # give a pose on their own; from 10 to 20 it is the same, with 30 it was lost
 _MAX_CONDITION = 1e12  # of the normal matrix; beyond, some motion is not observable
 
 
@@ -29,6 +35,24 @@ class Measurements:
 
     points_local: NDArray[np.float64]  # (N, 3) [m]
     seen: Sightings  # (N,)
+    images: NDArray[np.int64]  # (N,), in which they were found
+
+    @property
+    def proven(self) -> NDArray[np.bool_]:
+        """Return (N,) True for those found in most images: they stand still."""
+        low, high = _PROVEN_IMAGES
+        if len(self.images) > _PROVEN:
+            most = int(-np.partition(-self.images, _PROVEN)[_PROVEN])
+            low = min(max(low, most), high)
+        return np.asarray(self.images >= low)
+
+    def take(self, rows: NDArray[np.int64]) -> Measurements:
+        """Return the rows (M,) alone."""
+        return Measurements(
+            points_local=self.points_local.take(rows, axis=0),
+            seen=self.seen.take(rows),
+            images=self.images.take(rows),
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -103,6 +127,18 @@ class PoseSolver:
         self._to_base = se3.adjoint(camera.T_base_cam)
 
     def search(self, measured: Measurements) -> Consensus | None:
+        """Return the pose that most pixels agree with, None if not found.
+
+        If proven landmarks agree on one, the others have no vote.
+        """
+        rows = np.flatnonzero(measured.proven)
+        if _LEAST_PROVEN <= len(rows) < len(measured.images):
+            found = self._consensus(measured.take(rows))
+            if found is not None and len(found.inlier_rows) >= _LEAST_PROVEN:
+                return replace(found, inlier_rows=rows.take(found.inlier_rows))
+        return self._consensus(measured)
+
+    def _consensus(self, measured: Measurements) -> Consensus | None:
         """Return the pose that most pixels agree with (AP3P, RANSAC), None if not found."""
         if len(measured.points_local) < 4:
             return None
@@ -178,14 +214,38 @@ class PoseSolver:
         steps: int,
         prior: Prior | None = None,
     ) -> _Descent | None:
-        """Return the result of Gauss-Newton, which rejects outliers after every step."""
+        """Return the result of Gauss-Newton by what agrees with the proven landmarks.
+
+        A thing that moves through the image may have more landmarks than the room.
+        """
         T_cam_local = se3.inverse(T_local_base @ self._camera.T_base_cam)
-        found = PoseErrors(self._camera, measured.points_local, measured.seen)
-        found.move(T_cam_local)
-        measures_depth = measured.seen.measures_depth
-        inliers, depth_inliers = np.ones(len(measures_depth), bool), measures_depth
+        errors = PoseErrors(self._camera, measured.points_local, measured.seen)
+        settle = partial(self._settle, errors, measured.seen.measures_depth, steps, prior)
+        proven = measured.proven
+        if np.count_nonzero(proven) >= _LEAST_PROVEN:
+            end = settle(T_cam_local, proven)
+            if end is not None and np.count_nonzero(end.inliers & proven) >= _LEAST_PROVEN:
+                return settle(se3.inverse(end.T_local_cam), end.inliers)
+        return settle(T_cam_local, np.ones(len(proven), bool))
+
+    def _settle(
+        self,
+        errors: PoseErrors,
+        measures_depth: NDArray[np.bool_],
+        steps: int,
+        prior: Prior | None,
+        T_cam_local: Transform,
+        usable: NDArray[np.bool_],
+    ) -> _Descent | None:
+        """Return the pose by the usable landmarks (N,), less the outliers after every step.
+
+        All landmarks that agree with it are its inliers.
+        """
+        errors.move(T_cam_local)
+        inliers, depth_inliers = usable, usable & measures_depth
         for _ in range(steps):
-            rows = found.rows(found.scale(inliers, depth_inliers)).reshape(7, -1)
+            scale = errors.scale(inliers & usable, depth_inliers & usable)
+            rows = errors.rows(scale).reshape(7, -1)
             products = rows @ rows.T
             normal, slopes = products[:6, :6], products[:6, 6]
             if prior is not None:
@@ -195,16 +255,16 @@ class PoseSolver:
             if step is None:
                 return None
             T_cam_local = se3.exp(step) @ T_cam_local
-            found.move(T_cam_local)
-            inliers = found.pixels_agree()
-            depth_inliers = inliers & measures_depth & found.depths_agree()
-            if np.count_nonzero(inliers) < 4:
+            errors.move(T_cam_local)
+            inliers = errors.pixels_agree()
+            depth_inliers = inliers & measures_depth & errors.depths_agree()
+            if np.count_nonzero(inliers & usable) < 4:
                 return None
             if step @ slopes < _SMALL_STEP**2:
                 break
         return _Descent(
             T_local_cam=se3.inverse(T_cam_local),
-            errors=found,
+            errors=errors,
             normal=normal,
             inliers=inliers,
             depth_inliers=depth_inliers,

@@ -29,6 +29,15 @@ class Sightings:
         """Return (N,) True where depth is measured."""
         return np.asarray(self.depth_m > 0)
 
+    def take(self, rows: NDArray[np.int64]) -> Sightings:
+        """Return the rows (M,) alone."""
+        return Sightings(
+            uv_px=self.uv_px.take(rows, axis=0),
+            sigma_px=self.sigma_px.take(rows),
+            depth_m=self.depth_m.take(rows),
+            inverse_depth_sigma_per_m=self.inverse_depth_sigma_per_m.take(rows),
+        )
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Errors:
