@@ -11,7 +11,7 @@ from test_source_ordered import Listed
 from sceneslam.interfaces import Source
 from sceneslam.sources.changes.passer_by import PasserBy
 from sceneslam.testing.room import CAMERA, RIG
-from sceneslam.types.errors import ConfigError
+from sceneslam.types.errors import ConfigError, InputError
 from sceneslam.types.observation import Observation
 
 WIDTH, HEIGHT = CAMERA.size_wh
@@ -83,11 +83,22 @@ def test_the_seed_alone_chooses_the_pattern() -> None:
     assert (images[0] != images[2]).any()
 
 
+def test_a_picture_of_another_size_is_passed_on() -> None:
+    small = replace(next(iter(seconds())), image_bgr=np.zeros((10, 10, 3), np.uint8))
+    assert passed(Listed([small], rig=RIG)) == [small]
+
+
+def test_a_camera_without_intrinsics_is_named() -> None:
+    with pytest.raises(InputError, match="intrinsics"):
+        passed(Listed([], rig=replace(RIG, camera=None)))
+
+
 @pytest.mark.parametrize(
     "key, value",
     [
         ("width_m", 0),
         ("height_m", -1),
+        ("height_m", float("inf")),
         ("distance_m", 0),
         ("speed_mps", 0),
         ("speed_mps", float("nan")),

@@ -42,9 +42,8 @@ class RgbdParts:
         camera = known.color_camera(depth_camera)
         extractor = FeatureExtractor(depth_camera, known, settings=settings)
         self.map = VisualMap(camera, depth_camera, settings=settings)
-        self.localizer = VisualLocalizer(
-            self.map, PoseSolver(camera, seed=settings.seed), settings=settings
-        )
+        solver = PoseSolver(camera, seed=settings.seed, min_inliers=settings.min_inliers)
+        self.localizer = VisualLocalizer(self.map, solver, settings=settings)
         self.eye = RectifyingExtractor(self.map, self.localizer, extractor)
         self.memory = MapHistory(self.map, self.localizer, self.eye, settings=settings)
         relocalizer = Relocalizer(self.map.keyframes, self.memory.recognizer)

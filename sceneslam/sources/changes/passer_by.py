@@ -12,10 +12,12 @@ from numpy.typing import NDArray
 from sceneslam.interfaces import Source
 from sceneslam.ros.pixels import locked
 from sceneslam.sources.changes.wrapped import Wrapped, check_sensor
+from sceneslam.types.errors import InputError
 from sceneslam.types.observation import Observation
-from sceneslam.types.ranges import check_above, check_least
+from sceneslam.types.ranges import check_inside, check_least
 from sceneslam.types.rig import Camera, Sensor
 
+_MOST_M = 20.0
 _TEXEL_M = 0.01
 _GRAINS = (2, 8, 32)  # texels, of the pattern's layers: seams, folds, pieces of clothing
 _CONTRAST = 20.0  # grey values (sigma), of each layer: alike in every octave, as in nature
@@ -41,8 +43,8 @@ class PasserBy(Wrapped):
         pause_s: float,
         seed: int,
     ) -> None:
-        check_above(0.0, width_m=width_m, height_m=height_m)
-        check_above(0.0, distance_m=distance_m, speed_mps=speed_mps)
+        check_inside(0.0, _MOST_M, width_m=width_m, height_m=height_m)
+        check_inside(0.0, _MOST_M, distance_m=distance_m, speed_mps=speed_mps)
         check_least(0.0, pause_s=pause_s)
         check_least(0, seed=seed)
         check_sensor(source, Sensor.IMAGE, effects="passer_by")
@@ -53,11 +55,15 @@ class PasserBy(Wrapped):
     def __iter__(self) -> Iterator[Observation]:
         """Yield the source's observations with the plane in their images."""
         camera, pattern = self.rig.camera, self._pattern()
+        if camera is None:
+            raise InputError("effects=passer_by needs the camera's intrinsics, got none")
         start_ns: int | None = None
         for observation in self._source:
             start_ns = observation.stamp_ns if start_ns is None else start_ns
             image_bgr = observation.image_bgr
-            if camera is None or image_bgr is None:
+            pictures = [one for one in (image_bgr, observation.depth_m) if one is not None]
+            # One of another size is left out later, which says so.
+            if image_bgr is None or any(one.shape[1::-1] != camera.size_wh for one in pictures):
                 yield observation
                 continue
             left_m = self._left_m(camera, (observation.stamp_ns - start_ns) * 1e-9)

@@ -14,12 +14,11 @@ from ..map.visual_map import VisualMap
 from ..see.features import Features
 from ..settings import RgbdSettings
 from .matching import Matches, match_anywhere, match_near
-from .pose_solver import Consensus, Measurements, PoseEstimate, PoseSolver, Prior
+from .pose_solver import MIN_INLIER_RATIO, Consensus, Measurements, PoseEstimate, PoseSolver, Prior
 from .residuals import Sightings
 
 _RADIUS_REFINED_PX = 10.0
 _WIDER = 2.5  # factor on the search radius, in the last try of a guided search
-_MIN_INLIER_RATIO = 0.4  # least share of inliers among the matches at a correct pose
 _MIN_FOUND_RATIO = 0.1  # found, of the expected landmarks: 0.05 by chance, 0.2 in an image
 
 
@@ -139,7 +138,7 @@ class VisualLocalizer:
         if estimate is None:
             return None
         count, possible = int(estimate.inliers.sum()), min(len(found.expected_ids), len(features))
-        least = max(_MIN_INLIER_RATIO * len(found), _MIN_FOUND_RATIO * possible)
+        least = max(MIN_INLIER_RATIO * len(found), _MIN_FOUND_RATIO * possible)
         if count < max(self._min_inliers, least):
             return None
         return VisualFix(

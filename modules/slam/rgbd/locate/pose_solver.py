@@ -14,18 +14,17 @@ from sceneslam.types.rig import Camera
 from sceneslam.types.se3 import Transform
 
 from .pose_errors import PoseErrors
-from .residuals import Sightings
+from .residuals import CHI2_PIXEL, Sightings
 
 _RANSAC_PX = 8.0  # error of rows while a camera begins to turn (rolling shutter)
 _RANSAC_TRIALS = 200
 _RANSAC_CONFIDENCE = 0.999
 _APPROACH_STEPS, _REFINEMENT_STEPS = 2, 5
 _SMALL_STEP = 0.3  # [sigma], size of the last step; a third of it remains
-# What moves was found in few images where it is now. Swept over fourteen runs with a passer-by,
-# see experiments/moving_things.md.
+MIN_INLIER_RATIO = 0.4  # least share of inliers among the matches at a correct pose
+# What moves was found in few images where it is now; swept in experiments/moving_things.md.
 _PROVEN_IMAGES = (3, 10)  # a landmark is proven if found in 3, where many were in more of them
 _PROVEN = 100  # landmarks, which are many
-_LEAST_PROVEN = 20  # give a pose on their own; from 10 to 20 it is the same, with 30 it was lost
 _MAX_CONDITION = 1e12  # of the normal matrix; beyond, some motion is not observable
 
 
@@ -117,12 +116,27 @@ class _Descent:
     inliers: NDArray[np.bool_]  # (N,), pixels agree
     depth_inliers: NDArray[np.bool_]  # (N,), depths agree too
 
+    def agreeing(self, used: NDArray[np.bool_], known: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return (N,) where the pixel is within its 95 % limit, given how sure the pose is.
+
+        That is by the landmarks that were `used` (N,), and a prior's normal matrix (6, 6).
+        """
+        residuals = self.errors.residuals[:2]
+        squares = (residuals**2).sum(axis=0)
+        by_used = squares[self.inliers & used]
+        variance = max(1.0, by_used.sum() / max(1, 2 * len(by_used) - 6))
+        slopes = self.errors.rows(np.ones((3, 1)))[:6, :2]  # (6, 2, N)
+        covariance = np.linalg.inv(self.normal / variance + known)
+        spread = np.einsum("ian,ij,jan->n", slopes, covariance, slopes)
+        return np.asarray(squares <= CHI2_PIXEL * (1.0 + spread))
+
 
 class PoseSolver:
     """Finds T_local_base; deterministic for a seed."""
 
-    def __init__(self, camera: Camera, *, seed: int) -> None:
-        self._camera, self._seed = camera, seed
+    def __init__(self, camera: Camera, *, seed: int, min_inliers: int = 20) -> None:
+        """Build; `min_inliers` proven landmarks give a pose on their own."""
+        self._camera, self._seed, self._min_inliers = camera, seed, min_inliers
         self._T_cam_base = se3.inverse(camera.T_base_cam)
         self._to_base = se3.adjoint(camera.T_base_cam)
 
@@ -132,9 +146,9 @@ class PoseSolver:
         If proven landmarks agree on one, the others have no vote.
         """
         rows = np.flatnonzero(measured.proven)
-        if _LEAST_PROVEN <= len(rows) < len(measured.images):
+        if self._min_inliers <= len(rows) < len(measured.images):
             found = self._consensus(measured.take(rows))
-            if found is not None and len(found.inlier_rows) >= _LEAST_PROVEN:
+            if found is not None and len(found.inlier_rows) >= self._min_inliers:
                 return replace(found, inlier_rows=rows.take(found.inlier_rows))
         return self._consensus(measured)
 
@@ -216,16 +230,21 @@ class PoseSolver:
     ) -> _Descent | None:
         """Return the result of Gauss-Newton by what agrees with the proven landmarks.
 
-        A thing that moves through the image may have more landmarks than the room.
+        A thing that moves through the image may have more landmarks than the room. All count where
+        proven landmarks do not agree on a pose, or most others contradict it.
         """
         T_cam_local = se3.inverse(T_local_base @ self._camera.T_base_cam)
         errors = PoseErrors(self._camera, measured.points_local, measured.seen)
         settle = partial(self._settle, errors, measured.seen.measures_depth, steps, prior)
         proven = measured.proven
-        if np.count_nonzero(proven) >= _LEAST_PROVEN:
+        if self._min_inliers <= np.count_nonzero(proven) < len(proven):
             end = settle(T_cam_local, proven)
-            if end is not None and np.count_nonzero(end.inliers & proven) >= _LEAST_PROVEN:
-                return settle(se3.inverse(end.T_local_cam), end.inliers)
+            agreed = 0 if end is None else np.count_nonzero(end.inliers & proven)
+            if end is not None and agreed >= max(self._min_inliers, 0.5 * np.count_nonzero(proven)):
+                usable = end.agreeing(proven, self._known(prior))
+                end = settle(se3.inverse(end.T_local_cam), usable)
+                if end is not None and end.inliers.mean() >= MIN_INLIER_RATIO:
+                    return end
         return settle(T_cam_local, np.ones(len(proven), bool))
 
     def _settle(
