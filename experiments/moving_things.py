@@ -34,6 +34,8 @@ def drive(module_name: str, overrides: list[str], seed: int) -> tuple[float, flo
     answers, _ = follow(module, (camera_only(observation) for observation in source))
     module.shutdown()
     held = [answer for answer in answers if answer.status is not TrackingStatus.LOST]
+    if not held:
+        return np.nan, np.nan, 0.0
     told = Trajectory(
         stamps_ns=np.array([answer.stamp_ns for answer in held]),
         T_world_base=np.stack([answer.T_local_base for answer in held]),

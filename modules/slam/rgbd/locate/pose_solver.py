@@ -141,16 +141,19 @@ class PoseSolver:
         self._to_base = se3.adjoint(camera.T_base_cam)
 
     def search(self, measured: Measurements) -> Consensus | None:
-        """Return the pose that most pixels agree with, None if not found.
+        """Return the pose that most pixels of proven landmarks agree with, None if not found.
 
-        If proven landmarks agree on one, the others have no vote.
+        That of all landmarks where many more agree with it.
         """
+        among_all = self._consensus(measured)
         rows = np.flatnonzero(measured.proven)
-        if self._min_inliers <= len(rows) < len(measured.images):
-            found = self._consensus(measured.take(rows))
-            if found is not None and len(found.inlier_rows) >= self._min_inliers:
-                return replace(found, inlier_rows=rows.take(found.inlier_rows))
-        return self._consensus(measured)
+        if among_all is None or not self._min_inliers <= len(rows) < len(measured.images):
+            return among_all
+        found = self._consensus(measured.take(rows))
+        least = max(self._min_inliers, MIN_INLIER_RATIO * len(among_all.inlier_rows))
+        if found is None or len(found.inlier_rows) < least:
+            return among_all
+        return replace(found, inlier_rows=rows.take(found.inlier_rows))
 
     def _consensus(self, measured: Measurements) -> Consensus | None:
         """Return the pose that most pixels agree with (AP3P, RANSAC), None if not found."""
