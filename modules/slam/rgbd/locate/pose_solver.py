@@ -143,14 +143,15 @@ class PoseSolver:
     def search(self, measured: Measurements) -> Consensus | None:
         """Return the pose that most pixels of proven landmarks agree with, None if not found.
 
-        That of all landmarks where many more agree with it.
+        That of all landmarks where many more agree with it; what was found once has no vote.
         """
         among_all = self._consensus(measured)
         rows = np.flatnonzero(measured.proven)
         if among_all is None or not self._min_inliers <= len(rows) < len(measured.images):
             return among_all
         found = self._consensus(measured.take(rows))
-        least = max(self._min_inliers, MIN_INLIER_RATIO * len(among_all.inlier_rows))
+        votes = np.count_nonzero(measured.images[among_all.inlier_rows] > 1)
+        least = max(self._min_inliers, MIN_INLIER_RATIO * votes)
         if found is None or len(found.inlier_rows) < least:
             return among_all
         return replace(found, inlier_rows=rows.take(found.inlier_rows))
@@ -246,7 +247,7 @@ class PoseSolver:
             if end is not None and agreed >= max(self._min_inliers, 0.5 * np.count_nonzero(proven)):
                 usable = end.agreeing(proven, self._known(prior))
                 end = settle(se3.inverse(end.T_local_cam), usable)
-                if end is not None and end.inliers.mean() >= MIN_INLIER_RATIO:
+                if end is not None and end.inliers[measured.images > 1].mean() >= MIN_INLIER_RATIO:
                     return end
         return settle(T_cam_local, np.ones(len(proven), bool))
 
