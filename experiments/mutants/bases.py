@@ -107,6 +107,7 @@ def bases(folder: Path) -> list[Base]:
         _single("rerun", "sinks.rerun"),
         _single("mcap_sink", "sinks.mcap", "+sinks@sinks.mcap=mcap"),
         _single("depth_gap", "effects", "effects=depth_gap"),
+        _single("passer_by", "effects", "effects=passer_by"),
         *(Base(name=name, overrides=(f"+experiment={name}",), part=name) for name in EXPERIMENTS),
     ]
 
