@@ -12,11 +12,10 @@ from __future__ import annotations
 import sys
 
 import numpy as np
-from rgbd_loop import MAX_GAP_S, build, camera_only, follow
+from rgbd_loop import MAX_GAP_S, build, camera_only, follow, poses_of
 
 from sceneslam.evaluation.accuracy import absolute_errors
 from sceneslam.types.observation import TrackingStatus
-from sceneslam.types.trajectory import Trajectory
 
 SEEDS = (11, 12, 13)
 PASSES = {
@@ -36,10 +35,7 @@ def drive(module_name: str, overrides: list[str], seed: int) -> tuple[float, flo
     held = [answer for answer in answers if answer.status is not TrackingStatus.LOST]
     if not held:
         return np.nan, np.nan, 0.0
-    told = Trajectory(
-        stamps_ns=np.array([answer.stamp_ns for answer in held]),
-        T_world_base=np.stack([answer.T_local_base for answer in held]),
-    )
+    told = poses_of(held)
     errors = absolute_errors(told, truth, MAX_GAP_S)
     return 1e3 * errors.rmse_m, 1e3 * errors.max_m, 100.0 * len(held) / len(answers)
 

@@ -23,6 +23,7 @@ from time import perf_counter, process_time, sleep
 
 import cv2
 import numpy as np
+from rgbd_loop import poses_of
 
 from sceneslam.evaluation.accuracy import absolute_errors
 from sceneslam.experiments.scripts import backwards, settings
@@ -88,10 +89,7 @@ def follow(
         cpu_ms.append(1e3 * (process_time() - cpu_s))
         wall_ms.append(1e3 * (perf_counter() - wall_s))
     held = [answer for answer in answers if answer.status is not TrackingStatus.LOST]
-    told = Trajectory(
-        stamps_ns=np.array([answer.stamp_ns for answer in held]),
-        T_world_base=np.stack([answer.T_local_base for answer in held]),
-    )
+    told = poses_of(held)
     revised, graph = module.get_trajectory(), module.get_map().pose_graph
     module.shutdown()
     return Run(

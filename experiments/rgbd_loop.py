@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import islice
 from typing import cast
@@ -68,6 +68,14 @@ def follow(module: RgbdSlam, observations: Iterable[Observation]) -> tuple[list[
     return answers, {"median [ms]": f"{median:.1f}", "p95 [ms]": f"{p95:.1f}"}
 
 
+def poses_of(held: Sequence[Tracking]) -> Trajectory:
+    """Return the poses of answers, at least one, as they were given."""
+    return Trajectory(
+        stamps_ns=np.array([answer.stamp_ns for answer in held]),
+        T_world_base=np.stack([answer.T_local_base for answer in held]),
+    )
+
+
 def loops(overrides: list[str]) -> Row:
     """Return what loops were closed, how many of them wrongly, and what it did."""
     source, module, truth = build(overrides)
@@ -75,10 +83,7 @@ def loops(overrides: list[str]) -> Row:
     revised, graph = module.get_trajectory(), module.get_map().pose_graph
     module.shutdown()
     held = [answer for answer in answers if answer.status is not TrackingStatus.LOST]
-    told = Trajectory(
-        stamps_ns=np.array([answer.stamp_ns for answer in held]),
-        T_world_base=np.stack([answer.T_local_base for answer in held]),
-    )
+    told = poses_of(held)
     errors = loop_errors(graph, truth) if graph else np.zeros((0, 2))
     wrong = (errors[:, 0] > WRONG_M) | (errors[:, 1] > WRONG_RAD)
     return {

@@ -13,7 +13,7 @@ from __future__ import annotations
 import sys
 
 import numpy as np
-from rgbd_loop import MAX_GAP_S, build, camera_only, follow
+from rgbd_loop import MAX_GAP_S, build, camera_only, follow, poses_of
 
 from sceneslam.evaluation.accuracy import absolute_errors
 from sceneslam.evaluation.association import interpolated
@@ -70,10 +70,7 @@ def bridge(overrides: list[str], length_s: float) -> str:
     revised = module.get_trajectory()
     module.shutdown()
     held = [answer for answer in answers if answer.status is not TrackingStatus.LOST]
-    told = Trajectory(
-        stamps_ns=np.array([answer.stamp_ns for answer in held]),
-        T_world_base=np.stack([answer.T_local_base for answer in held]),
-    )
+    told = poses_of(held)
     times_s = (told.stamps_ns - stamps_ns[0]) * 1e-9
     inside = (times_s >= gap_s[0]) & (times_s < gap_s[1])
     within = Trajectory(stamps_ns=told.stamps_ns[inside], T_world_base=told.T_world_base[inside])
